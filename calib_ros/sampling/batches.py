@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages into the session in batches, of live topics and of recordings.
 
-Serialised messages of one stream with the same layout are decoded at once; others one by one, and
-grouped by their names. Both give the same arrays, with the place of each message in the batch.
+Messages of one stream with the same layout are decoded at once; those of bodies and cameras one by
+one, and grouped by their names. Both give the same arrays, with the place of each in the batch.
 """
 
 from __future__ import annotations
 
 import itertools
+import struct
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,17 +19,18 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.cdr import alike, read_header
+from calib_ros.sampling.cdr import alike, message_layout, read_header
 from calib_ros.sampling.messages import (
+    BODIES,
     CAMERA_INFO,
+    FORMS,
     JOINT_STATE,
     LINKS,
-    PICTURES,
     TRANSFORMS,
     MessageError,
     Reading,
+    bodies_of,
     frame_name,
-    readings_of,
 )
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
@@ -38,10 +40,12 @@ from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.texts import LARGEST_TABLE
 
 BATCH = 2000  # messages taken at once (benchmarks/bags.py, benchmarks/soak.py)
-OF_CAMERAS = (*PICTURES, CAMERA_INFO)
 Deserialise: TypeAlias = Callable[[bytes, str], Any]  # converts bytes and a type to a message
 Batch: TypeAlias = 'Sequence[tuple[Stream, bytes]]'
 """Streams and their serialised messages, in order of arrival."""
+
+
+UNDECODED = 'a message on {} cannot be decoded: {!r}'
 
 
 @dataclass(frozen=True)
@@ -134,7 +138,9 @@ def decode(
     parts: list[Part] = []
     problems: list[str] = []
     linked: dict[Links, tuple[list[Part], list[Part]]] = {}  # moving and still ones
-    for stream, part in _read(batch, deserialise, pictures, miss, problems):
+    decoded = _by_layout(batch, miss, problems)
+    others = _one_by_one(batch, deserialise, pictures, problems)
+    for stream, part in itertools.chain(decoded, others):
         if stream.type != JOINT_STATE and any(name[:1] == '/' for name in part.strings):
             part = part._replace(strings=tuple(map(frame_name, part.strings)))
         if stream.links is None:
@@ -149,20 +155,14 @@ def decode(
     return parts, problems
 
 
-def _read(
-    batch: Batch,
-    deserialise: Deserialise,
-    pictures: Pictures | None,
-    miss: Callable[[str, int, str], None],
-    problems: list[str],
+def _by_layout(
+    batch: Batch, miss: Callable[[str, int, str], None], problems: list[str]
 ) -> Iterator[tuple[Stream, Part]]:
-    """Yield messages with the same names, and their stream."""
-    single: list[int] = []
-    groups: dict[tuple[str, int], list[int]] = {}
+    """Yield joint states and measurements with the same names, and their stream."""
+    groups: dict[tuple[str, int, bytes], list[int]] = {}
     for place, (stream, data) in enumerate(batch):
-        of_camera = stream.type in OF_CAMERAS
-        group = single if of_camera else groups.setdefault((stream.topic, len(data)), [])
-        group.append(place)
+        if stream.type in FORMS:
+            groups.setdefault((stream.topic, len(data), data[:2]), []).append(place)
     for group in groups.values():
         stream, places = batch[group[0]][0], np.array(group)
         left = np.ones(len(places), dtype=bool)
@@ -171,25 +171,36 @@ def _read(
         for which, names, stamps, numbers in alike(stream.type, blobs, known):
             left[which] = False
             yield stream, Part(places[which], stream.source, names, stamps, numbers)
-        single += places[left].tolist()
-    rows: dict[tuple[Stream, tuple[str, ...], int], list[tuple[int, int, FloatArray]]] = {}
-    for place in sorted(single):
-        stream, data = batch[place]
+        for k in np.flatnonzero(left).tolist():
+            try:
+                message_layout(stream.type, blobs[k])
+            except MessageError as err:
+                miss(JOINTS, 1, str(err))
+            except (struct.error, UnicodeDecodeError) as err:
+                problems.append(UNDECODED.format(stream.topic, err))
+
+
+def _one_by_one(
+    batch: Batch, deserialise: Deserialise, pictures: Pictures | None, problems: list[str]
+) -> Iterator[tuple[Stream, Part]]:
+    """Yield bodies and images with the same names, and their stream; learn from cameras."""
+    rows: dict[tuple[Stream, tuple[str, ...]], list[tuple[int, int, FloatArray]]] = {}
+    for place, (stream, data) in enumerate(batch):
+        if stream.type in FORMS:
+            continue
         message = partial(deserialise, data, stream.type)
         try:
-            if stream.type in OF_CAMERAS:
-                found = _kept(stream, data, message, pictures)
+            if stream.type in BODIES:
+                found = bodies_of(stream.type, message())
             else:
-                found = readings_of(stream.type, message())
+                found = _kept(stream, data, message, pictures)
             held = [(stamp, names, np.array(row, dtype=float)) for stamp, names, row in found]
-        except MessageError as err:
-            miss(JOINTS, 1, str(err))
         except Exception as err:  # damaged bytes fail in many ways
-            problems.append(f'a message on {stream.topic} cannot be decoded: {err!r}')
+            problems.append(UNDECODED.format(stream.topic, err))
         else:
             for stamp, names, row in held:
-                rows.setdefault((stream, names, len(row)), []).append((place, stamp, row))
-    for (stream, names, _), same in rows.items():
+                rows.setdefault((stream, names), []).append((place, stamp, row))
+    for (stream, names), same in rows.items():
         places, stamps, numbers = map(np.array, zip(*same, strict=True))
         yield stream, Part(places, stream.source, names, stamps, numbers)
 

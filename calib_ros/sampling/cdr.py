@@ -5,7 +5,6 @@
 Messages of one topic mostly differ only in stamps and numbers: the names, and so the offsets of
 the numbers (OMG Common Data Representation), are the same. The layout is derived from the first
 message, others of its length are compared with it byte by byte, and all numbers are read at once.
-Messages without a layout must be decoded one by one.
 """
 
 from __future__ import annotations
@@ -14,28 +13,19 @@ import struct
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
-from calib_ros.sampling.messages import JOINT_STATE, TRANSFORM, TRANSFORMS
+from calib_ros.sampling.messages import FORMS, JOINT_STATE, TRANSFORMS, MessageError
 from calib_ros.sampling.slices import Stamps
 from calib_ros.values import MOST_NAMES
 
-LITTLE_ENDIAN = b'\x00\x01'
-_HEAD = len(LITTLE_ENDIAN) + 2  # encapsulation: encoding and options
-_FORMS: dict[str, tuple[int, int, str, int]] = {
-    JOINT_STATE: (1, 0, '<f8', 0),
-    TRANSFORM: (2, 0, '<f8', 7),
-    TRANSFORMS: (2, 0, '<f8', 7),
-    'geometry_msgs/msg/PoseStamped': (1, 0, '<f8', 7),
-    'geometry_msgs/msg/PointStamped': (1, 0, '<f8', 3),
-    'geometry_msgs/msg/PoseWithCovarianceStamped': (1, 0, '<f8', 43),
-    'nav_msgs/msg/Odometry': (2, 0, '<f8', 43),
-    'sensor_msgs/msg/Range': (1, 13, '<f4', 1),  # after field of view, least and greatest range
-}
-"""By type: strings before the numbers, bytes between, kind and count of the numbers."""
+BYTE_ORDERS = {b'\x00\x01': '<', b'\x00\x00': '>'}
+"""Order of bytes by the encoding of a message."""
+_HEAD = struct.calcsize('2s2s')  # encoding and options
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +37,7 @@ class MessageLayout:
 
     strings: tuple[tuple[str, ...], ...]
     stamps: Index  # (K, 2) places of seconds and nanoseconds
-    kind: str
+    kind: str  # of the numbers, with the order of bytes
     numbers: Index  # (K, w) places
     begin: int  # offset of the first common byte
     text: NDArray[np.uint8]  # the common bytes
@@ -70,57 +60,62 @@ class MessageLayout:
         """Yield the strings, stamps (N,) and numbers (N, w) of each part of messages (N, ...)."""
         length = rows.shape[1] - _HEAD
         whole = slice(_HEAD, _HEAD + length - length % int(self.kind[2:]))
-        words = np.ascontiguousarray(rows[:, whole]).view('<i4')
+        order, words = self.kind[0], np.ascontiguousarray(rows[:, whole])
+        words = words.view(f'{order}i4')
         times = words.take(self.stamps, axis=1)  # nanoseconds are without sign
-        stamps = times[..., 0].astype(np.int64) * 1_000_000_000 + times.view('<u4')[..., 1]
+        stamps = times[..., 0].astype(np.int64) * 1_000_000_000 + times.view(f'{order}u4')[..., 1]
         numbers = words.view(self.kind).take(self.numbers, axis=1).astype(float, copy=False)
         for k, strings in enumerate(self.strings):
             yield strings, stamps[:, k], numbers[:, k]
 
 
-def alike(
-    kind: str, blobs: Sequence[bytes], known: dict[int, list[MessageLayout]]
-) -> Iterator[tuple[Index, tuple[str, ...], Stamps, FloatArray]]:
-    """Yield what messages of one type and length hold, those of each layout at once.
+Layouts: TypeAlias = dict[tuple[int, bytes], list[MessageLayout]]
+"""Layouts by the length and the encoding of messages."""
 
-    Their indices (N,), the strings, stamps (N,) and numbers (N, w) of a part; those without a
-    layout are left out. Layouts `known` by message length are reused, and new ones added, up to
-    MOST_NAMES.
+
+def alike(
+    kind: str, blobs: Sequence[bytes], known: Layouts
+) -> Iterator[tuple[Index, tuple[str, ...], Stamps, FloatArray]]:
+    """Yield what messages of one type, encoding and length hold, those of each layout at once.
+
+    Their indices (N,), the strings, stamps (N,) and numbers (N, w) of a part; damaged ones are
+    left out. Layouts that are `known` are reused, and new ones added, up to MOST_NAMES.
     """
-    length = len(blobs[0])
-    if length < _HEAD or kind not in _FORMS:
-        return
+    length, encoding = len(blobs[0]), blobs[0][:2]
     rows = np.frombuffer(b''.join(blobs), dtype=np.uint8).reshape(len(blobs), length)
-    rest = np.flatnonzero((rows[:, :2] == tuple(LITTLE_ENDIAN)).all(axis=1))
+    rest = np.arange(len(rows))
     if len(known) == MOST_NAMES:
         known.clear()
-    layouts = known.setdefault(length, [])
-    untried, found = list(layouts), 0
-    while len(rest) and found < MOST_NAMES:
+    layouts = known.setdefault((length, encoding), [])
+    untried, tried = list(layouts), 0
+    while len(rest):
         if untried:
             layout = untried.pop(0)
         else:
             try:
-                layout = _layout(kind, blobs[rest[0]])
-            except (struct.error, UnicodeDecodeError):
+                layout = message_layout(kind, blobs[rest[0]])
+            except (struct.error, UnicodeDecodeError, MessageError):
                 rest = rest[1:]
                 continue
             if len(layouts) == MOST_NAMES:
                 layouts.clear()
             layouts.append(layout)
-        left = rows if len(rest) == len(rows) else rows[rest]
+        some = rest if tried < MOST_NAMES else rest[:1]  # of so many names, each by itself
+        tried += 1
+        left = rows if len(some) == len(rows) else rows[some]
         equal = layout.among(left)
         if equal.any():
-            found += 1
             for part in layout.read(left if equal.all() else left[equal]):
-                yield rest[equal], *part
-        rest = rest[~equal]
+                yield some[equal], *part
+        rest = np.concatenate([some[~equal], rest[len(some) :]])
 
 
-def _layout(kind: str, blob: bytes) -> MessageLayout:
-    """Return the layout of a message, or raise struct.error."""
-    texts, between, numbers, count = _FORMS[kind]
-    read, size = _Reader(blob), int(numbers[2:])
+def message_layout(kind: str, blob: bytes) -> MessageLayout:
+    """Return the layout of a message; raise what is wrong with a damaged one."""
+    if blob[:2] not in BYTE_ORDERS:
+        raise struct.error('it is not in CDR')
+    texts, between, numbers, count = FORMS[kind]
+    read, size = _Reader(blob), int(numbers[1:])
     parts, begins = list[tuple[str, ...]](), list[tuple[int, int]]()
     for _ in range(read.integer() if kind == TRANSFORMS else 1):
         stamp = _aligned(read.at, 4)
@@ -130,11 +125,11 @@ def _layout(kind: str, blob: bytes) -> MessageLayout:
             strings += [read.string() for _ in range(read.integer())]
             count = read.integer()
             if len(strings) != count + 1:
-                raise struct.error
+                raise MessageError('names and positions differ in number')
         begin = _aligned(read.at + between, size)
         read.at = begin + count * size
         if read.at > len(blob):
-            raise struct.error
+            raise struct.error('it is cut off')
         parts.append(tuple(strings))
         begins.append((stamp, begin))
     mask = np.zeros(read.named[-1].stop, dtype=np.uint8)
@@ -145,7 +140,7 @@ def _layout(kind: str, blob: bytes) -> MessageLayout:
     return MessageLayout(
         tuple(parts),
         places[:, :1] // 4 + np.arange(2),
-        numbers,
+        BYTE_ORDERS[blob[:2]] + numbers,
         places[:, 1:] // size + np.arange(count),
         read.named[0].start,
         text,
@@ -158,7 +153,7 @@ class _Reader:
     """Reader of the names in a message from offset `at`; `named` are their slices."""
 
     def __init__(self, blob: bytes) -> None:
-        self._blob, self._order = blob, '<' if blob[:2] == LITTLE_ENDIAN else '>'
+        self._blob, self._order = blob, BYTE_ORDERS.get(blob[:2], '>')
         self.at = _HEAD
         self.named: list[slice] = []
 

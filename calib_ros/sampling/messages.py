@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages to numbers.
+"""Types of messages, and what is read of them.
 
-Messages are read by their attributes only, so those of rclpy and rosbags are alike.
+Decoded ones are read by their attributes only, so those of rclpy and rosbags are alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 from calib_ros.errors import InputError
@@ -21,6 +21,19 @@ BODIES = {
 }
 """Message types of named poses in one frame (motion capture): fields of poses and names."""
 LINKS = (TRANSFORMS, *BODIES)  # message types that link several frames at once
+FORMS: dict[str, tuple[int, int, str, int]] = {
+    'geometry_msgs/msg/PoseStamped': (1, 0, 'f8', 7),
+    'geometry_msgs/msg/PoseWithCovarianceStamped': (1, 0, 'f8', 43),
+    'geometry_msgs/msg/PointStamped': (1, 0, 'f8', 3),
+    TRANSFORM: (2, 0, 'f8', 7),
+    'nav_msgs/msg/Odometry': (2, 0, 'f8', 43),
+    'sensor_msgs/msg/Range': (1, 13, 'f4', 1),  # after field of view, least and greatest range
+    TRANSFORMS: (2, 0, 'f8', 7),
+    JOINT_STATE: (1, 0, 'f8', 0),
+}
+"""By type: strings before the numbers, bytes between, kind and count of the numbers."""
+MEASURES = tuple(kind for kind in FORMS if kind not in (TRANSFORMS, JOINT_STATE))
+"""Types of messages that hold one measurement."""
 PICTURES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 
@@ -33,45 +46,16 @@ class MessageError(InputError):
     """A message that cannot be used."""
 
 
-def _pose(at: Any, turn: Any) -> Sequence[float]:
-    return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
-
-
-def _pose_with_covariance(message: Any) -> Sequence[float]:
-    pose = message.pose.pose
-    return *_pose(pose.position, pose.orientation), *message.pose.covariance
-
-
-DECODERS: dict[str, Callable[[Any], Sequence[float]]] = {
-    'geometry_msgs/msg/PoseStamped': lambda m: _pose(m.pose.position, m.pose.orientation),
-    'geometry_msgs/msg/PoseWithCovarianceStamped': _pose_with_covariance,
-    'geometry_msgs/msg/PointStamped': lambda m: (m.point.x, m.point.y, m.point.z),
-    TRANSFORM: lambda m: _pose(m.transform.translation, m.transform.rotation),
-    'nav_msgs/msg/Odometry': _pose_with_covariance,
-    'sensor_msgs/msg/Range': lambda m: (m.range,),
-}
-"""Measurement types, and functions from messages to numbers."""
-
-
-def readings_of(kind: str, message: Any) -> list[Reading]:
-    """Return what a message holds: one row, or one for each of its transforms or bodies."""
-    if kind == TRANSFORMS:
-        return [row for each in message.transforms for row in readings_of(TRANSFORM, each)]
+def bodies_of(kind: str, message: Any) -> list[Reading]:
+    """Return a row for each body of a message, with its pose."""
     stamp_ns, frame_id = head_of(message)
-    if kind == JOINT_STATE:
-        if len(message.name) != len(message.position):
-            raise MessageError('names and positions differ in number')
-        return [(stamp_ns, (frame_id, *message.name), message.position)]
-    if kind in BODIES:
-        bodies, name = BODIES[kind]
-        return [
-            (stamp_ns, (frame_id, getattr(body, name)), _pose(at.position, at.orientation))
-            for body in getattr(message, bodies)
-            for at in (body.pose,)
-        ]
-    child = getattr(message, 'child_frame_id', None)
-    strings = (frame_id,) if child is None else (frame_id, child)
-    return [(stamp_ns, strings, DECODERS[kind](message))]
+    bodies, name = BODIES[kind]
+    found: list[Reading] = []
+    for body in getattr(message, bodies):
+        at, turn = body.pose.position, body.pose.orientation
+        numbers = (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)
+        found.append((stamp_ns, (frame_id, getattr(body, name)), numbers))
+    return found
 
 
 def head_of(message: Any) -> tuple[int, str]:

@@ -11,8 +11,8 @@ from typing import Any
 
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.sampling.messages import (
-    DECODERS,
     LINKS,
+    MEASURES,
     PICTURES,
     TRANSFORMS,
     frame_name,
@@ -77,7 +77,7 @@ class Source:
 
 
 LENSES = ('given', 'fitted')
-TYPES = (*DECODERS, *LINKS, *PICTURES)  # message types of measurements
+TYPES = (*MEASURES, *LINKS, *PICTURES)  # message types of measurements
 
 STANDARD = (
     Source('measured_pose', 'geometry_msgs/msg/PoseStamped'),

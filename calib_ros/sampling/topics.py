@@ -11,9 +11,9 @@ from calib_ros.errors import InputError
 from calib_ros.sampling.batches import Deserialise, Stream, batches, decode, source_streams
 from calib_ros.sampling.messages import (
     CAMERA_INFO,
-    DECODERS,
     JOINT_STATE,
     LINKS,
+    MEASURES,
     PICTURES,
     short_type,
 )
@@ -63,13 +63,13 @@ def choose_topics(recorded: Recorded, settings: Settings) -> dict[str, Stream]:
     for source in sources:
         kind = available.get(source.topic, '')
         if kind not in TYPES or source.type != kind:
-            expected = (source.type,) if source.type else tuple(DECODERS)
+            expected = (source.type,) if source.type else MEASURES
             raise _no_topic(f'"{source.topic}"', expected, available)
         if source.board and available.get(source.camera_info) != CAMERA_INFO:
             error = _no_topic(f'"{source.camera_info}"', (CAMERA_INFO,), available)
             raise InputError(f'{error}; name its topic in sources (info=TOPIC), or record it too')
     if all(source.validation for source in sources):
-        error = _no_topic('pose topic', tuple(DECODERS), available)
+        error = _no_topic('pose topic', MEASURES, available)
         raise InputError('; '.join([str(error), *_others(recorded)]))
     streams = [Stream(topic, JOINT_STATE) for topic in joints] + source_streams(sources, available)
     chosen = {stream.topic: stream for stream in streams if stream.topic in available}
@@ -132,7 +132,7 @@ def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
     sources = [
         parse_source(topic, available)
         for topic, kind in available.items()
-        if kind in DECODERS and topic not in own
+        if kind in MEASURES and topic not in own
     ]
     fitted = sorted(source.topic for source in sources if not source.validation)
     if len(fitted) > 1:

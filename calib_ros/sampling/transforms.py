@@ -21,7 +21,7 @@ import numpy as np
 from calib_ros.errors import MOST_ENTRIES
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.cdr import MessageLayout
+from calib_ros.sampling.cdr import Layouts
 from calib_ros.sampling.message_filter import usable
 from calib_ros.sampling.messages import TRANSFORMS, short_type
 from calib_ros.sampling.slices import Part
@@ -75,7 +75,7 @@ class Links:
         self._routes: dict[Source, Route | str] = dict.fromkeys(sources, '')
         self._parents = defaultdict[str, list[Pair]](list)  # links by child frame
         self._known = False  # whether the routes are up to date
-        self.layouts: dict[int, list[MessageLayout]] = {}  # layouts by message length
+        self.layouts: Layouts = {}
         self._held: deque[Part] = deque()
         self._let_go: Counter[Pair] = Counter()
 

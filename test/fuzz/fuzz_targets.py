@@ -251,12 +251,12 @@ def message(data):
     """The first byte chooses the type; messages are divided by a mark."""
     from calib_ros.files.bags import _deserialiser
     from calib_ros.sampling.batches import Stream, feed
-    from calib_ros.sampling.messages import DECODERS, JOINT_STATE
+    from calib_ros.sampling.messages import JOINT_STATE, MEASURES
     from calib_ros.sampling.session import CalibrationSession
     from calib_ros.sampling.sources import Source
 
     session = CalibrationSession(ARM)
-    types = [JOINT_STATE, *DECODERS]
+    types = [JOINT_STATE, *MEASURES]
     batch = []
     for part in data.split(MARK):
         kind = types[part[0] % len(types)] if part else JOINT_STATE

@@ -3,7 +3,7 @@
 import pytest
 
 from calib_ros.errors import ConfigError
-from calib_ros.sampling.messages import DECODERS, TRANSFORMS
+from calib_ros.sampling.messages import MEASURES, TRANSFORMS
 from calib_ros.sampling.sources import RANGEFINDER, STANDARD, Source, parse_source, parse_sources
 
 
@@ -17,7 +17,7 @@ def test_keys_in_any_order():
     assert source == Source('/cam', kind, 'left', 'board', eye_in_hand=True, validation=True)
 
 
-@pytest.mark.parametrize('kind', sorted(DECODERS))
+@pytest.mark.parametrize('kind', sorted(MEASURES))
 def test_a_short_type_will_do(kind):
     short = kind.rpartition('/')[2]
     assert parse_source(f'/x type={short}') == parse_source(f'/x type={kind}')
