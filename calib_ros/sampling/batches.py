@@ -45,7 +45,7 @@ Batch: TypeAlias = 'Sequence[tuple[Stream, bytes]]'
 """Streams and their serialised messages, in order of arrival."""
 
 
-UNDECODED = 'a message on {} cannot be decoded: {!r}'
+UNDECODED = 'a message on {} cannot be decoded: {}'
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def _one_by_one(
                 found = _kept(stream, data, message, pictures)
             held = [(stamp, names, np.array(row, dtype=float)) for stamp, names, row in found]
         except Exception as err:  # damaged bytes fail in many ways
-            problems.append(UNDECODED.format(stream.topic, err))
+            problems.append(UNDECODED.format(stream.topic, repr(err)))
         else:
             for stamp, names, row in held:
                 rows.setdefault((stream, names), []).append((place, stamp, row))
