@@ -109,10 +109,9 @@ def _fit_all(
     if simpler is None and (fitted.noise.consistent or size <= 1.0):
         size = min(size, _likely_noise(fitted))
     posterior = posterior_of(fitted, size, judging=False)
-    held = max((posterior.held(n) for n in names if n not in problem.given), default=0.0)
-    alone = problem.learned is None and not problem.model.effects
-    if alone and held <= 1.0 - CONFIDENT:  # the priors found would not change the fit
-        return fitted
+    told = (posterior.held(n) <= 1.0 - CONFIDENT for n in names if n not in problem.given)
+    if problem.learned is None and not problem.model.effects and all(told):
+        return fitted  # the priors found would not change the fit
     for _ in range(ROUNDS):
         priors = {
             name: min(posterior.priors[name], problem.common_sense(name))

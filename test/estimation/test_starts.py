@@ -237,6 +237,15 @@ def test_distances_start_right_among_gross_errors_that_agree():
     np.testing.assert_allclose(found.base.matrix[:3, :3], np.eye(3))  # no distance tells a turn
 
 
+def test_the_closed_form_of_distances_is_exact(rng):
+    tool = random_frame(rng, 0.2)
+    base = replace(Frame(), matrix=se3.transform(np.eye(3), np.array([0.6, -2.0, 0.4])))
+    seen = measure(replace(UR10E, base=base, tool=tool), UR10E.random_joints(30, rng), rng)
+    wires = replace(seen, distances=norms(seen.positions))
+    placed = start._trilaterated(replace(UR10E, tool=tool), start.flange(UR10E, wires), wires)
+    np.testing.assert_allclose(placed.frame('base').matrix, base.matrix, atol=1e-9)
+
+
 @pytest.mark.parametrize('height', [0.05, 1.5])
 def test_distances_place_an_arm_that_moves_in_a_plane(height, rng):
     """From its plane no small change shows: a start at height zero stayed there, 70 mm off."""
