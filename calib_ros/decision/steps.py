@@ -294,7 +294,7 @@ class _Scan:
         sets = found.group.sets
         kept = np.concatenate([self._weights[k] > 0.0 for k in sets])
         numbers = np.concatenate([self._numbers[k] for k in sets])
-        gross, every = np.setdiff1d(numbers[~kept], numbers[kept]), np.unique(numbers)
+        gross, every = np.setdiff1d(numbers, numbers[kept]), np.unique(numbers)
         after = 2 * np.count_nonzero(every >= found.stop) < len(every)
         return 0 < int(np.count_nonzero((gross >= found.stop) == after)) < LEAST_ASIDE
 
