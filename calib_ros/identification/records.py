@@ -136,7 +136,7 @@ class Record:
         """
         known = self.content.get('table_sha256')
         converted = self._part('nominal').get('convention', chain.convention) != chain.convention
-        names = (self.content.get('region') or {}).get('names', ())
+        names = self._part('region').get('names', ())
         order = {name: k for k, name in enumerate(names)}
         effects = tuple(sorted(chain.effects, key=lambda each: order.get(each[0], -1)))
         same = known is None or converted or known == table_hash(replace(chain, effects=effects))

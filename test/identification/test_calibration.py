@@ -79,7 +79,7 @@ def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nomi
     for name in ('names', 'freedom', 'noise', 'owners', 'world_frame'):
         assert getattr(read, name) == getattr(found, name)
     np.testing.assert_allclose(read.before.table, found.before.table, atol=1e-15)
-    assert read.record['robot_serial'] == '7'
+    assert read.serial_of('c.yaml') == read.serial_of('c.yaml', '7') == '7'
 
 
 def test_the_nominal_chain_of_axes_that_coincide_has_no_b():
@@ -100,6 +100,7 @@ def test_the_nominal_chain_of_axes_that_coincide_has_no_b():
         ('covariance', {'names': ['no_joint.a']}),
         ('covariance', {'freedom': 'many'}),
         ('covariance', 5),
+        ('region', 5),
         ('noise_in_sigma', {'position': 'small'}),
         ('noise_in_sigma', {'shared': None}),
         ('noise_in_sigma', {'given': {'sigma_position': 'small'}}),
@@ -189,6 +190,7 @@ def test_a_calibration_is_read_from_its_file_or_folder(tmp_path):
     for path in (tmp_path, tmp_path / 'calibration.yaml', str(tmp_path)):
         found = load_calibration(path, UR)
         assert found.record == record
+        assert found.serial_of(str(path), '8') == '8'
         assert found.chain.joints[1].a == pytest.approx(UR.joints[1].a + 1e-3, abs=1e-12)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.observations import Observations
-from calib_ros.identification.records import KEPT, Fingerprint, reused_in_words
+from calib_ros.identification.records import KEPT, Fingerprint, hashes, reused_in_words
 
 
 def rows(count, seed=0):
@@ -36,6 +36,14 @@ def test_what_was_measured_counts_and_not_the_configuration_alone():
     assert found.share([replace(fitted, distances=other)]) == 0.0
     lengths = Fingerprint.of([replace(fitted, distances=other)])
     assert lengths.share([replace(rows(60), distances=other)]) == 1.0
+    images = replace(fitted, pixels=fitted.joints[:, :2], points=fitted.positions)
+    assert found.share([images]) == 0.0
+    assert Fingerprint.of([images]).share([replace(images, positions=0.0 * images.points)]) == 1.0
+
+
+def test_files_of_before_hold_these_hashes():
+    seen = Observations.from_arrays([[0.1, -0.2, 0.3]], [[1.0, 2.0, -3.0]])
+    assert hashes([seen]).tolist() == [0xA33B42E5142807AD]
 
 
 @pytest.mark.parametrize('count', [60, 10 * KEPT])
