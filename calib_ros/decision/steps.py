@@ -265,7 +265,7 @@ class _Scan:
             whole = everything - float(rank[k])
             squares = float(gain[k]) * whole / max(total - float(gain[k]), 1e-300)
             trials = self._stops * len(self._groups)
-            by_chance = trials * chance_of(squares, max(int(rank[k]), 1), whole)
+            by_chance = trials * chance_of(squares, int(rank[k]), whole)
             criterion = equations * np.log1p(-share[k]) + rank[k] * np.log(equations)
             if beyond > least and by_chance < 1.0 - SURE and criterion < lowest:
                 lowest, size = criterion, root[k] @ along[k]

@@ -53,8 +53,9 @@ PRINTED = 5e-3  # scale of a printed board (assumed): 1 mm of 200
 
 
 def chance_of(squares: float, rank: int, freedom: float) -> float:
-    """Return the probability of such squares in `rank` directions by noise alone.
+    """Return the probability of such squares in `rank` directions, or one, by noise alone.
 
     `freedom` are the degrees of freedom of the noise estimate.
     """
+    rank = max(rank, 1)
     return float(special.fdtrc(rank, min(freedom, KNOWN), max(squares, 0.0) / rank))
