@@ -158,10 +158,14 @@ class FrameNames:
 
     @property
     def different(self) -> tuple[str, ...]:
-        """Return the different frames of one device, but for a few measurements; empty if none."""
+        """Return the frames of one device if more than a few measurements are not in its own.
+
+        That is the required one, as soon as any are in it.
+        """
         for device, known in self._known.items():
             few = known.total() - max(known.values()) <= EXCEPTION * known.total()
-            if not few and not self.required(device):
+            required = self.required(device)
+            if required not in known if required else not few:
                 return tuple(sorted(known))
         return ()
 

@@ -174,9 +174,11 @@ class CalibrationSession:
 
     @property
     def _different(self) -> str:
-        """Return that one device measured in different frames, if it matters."""
+        """Return that one device measured in different frames, or only in others than wanted."""
         frames = ', '.join(some([name or 'one without name' for name in self._frames.different]))
-        return frames and f'poses came in different frames ({frames})'
+        wanted = self._frames.wanted
+        which = f'frames other than frame_id "{wanted}"' if wanted else 'different frames'
+        return frames and f'poses came in {which} ({frames})'
 
     @property
     def state(self) -> str:

@@ -124,12 +124,19 @@ def test_frame_id_helps_at_once_when_frames_differ():
     made.change(replace(made.settings, frame_id='left'))
     assert sum(len(each) for each in made.problem().sets) == 30
     assert len(made.samples) == 50
-    made.change(replace(made.settings, frame_id='none'))
-    with pytest.raises(InputError, match='50 x poses left out, in another frame'):
-        made.problem()
-    begun = session(samples(5, frame_id='left'), frame_id='right')
-    with pytest.raises(InputError, match='5 x poses left out, in another frame'):
+
+
+def test_a_frame_id_in_which_nothing_is_measured_is_told_at_once():
+    """It was mistyped, in the last session or now, and leaves no pose to use."""
+    begun = session(samples(5, frame_id='left'), frame_id='lefd')
+    with pytest.raises(InputError, match=r'other than frame_id "lefd" \(left\)'):
         begun.problem()
+    begun.change(replace(begun.settings, frame_id='left'))
+    assert 'frame_id' not in begun.status()
+    begun.change(replace(begun.settings, frame_id='none'))
+    assert 'other than frame_id "none" (left): set frame_id' in begun.status()
+    assert begun.doubtful
+    assert begun.account().notes == {LEFT_OUT: 5}
 
 
 @pytest.mark.parametrize('late', [False, True])
