@@ -79,11 +79,11 @@ class BoardCamera:
 
         Its lens is that at its stamp: recordings are read ahead of their images.
         """
-        if not self._told:
-            reason = f'no CameraInfo of it has come on {self._source.camera_info}'
-            return Flaw('before any CameraInfo', reason)
         later = bisect.bisect_right(self._told, head_of(message)[0], key=_stamp)
-        _, lens, size = self._told[max(later - 1, 0)]
+        if not later:
+            reason = f'no CameraInfo up to its stamp has come on {self._source.camera_info}'
+            return Flaw('before any CameraInfo', reason)
+        _, lens, size = self._told[later - 1]
         if isinstance(lens, Flaw):
             return lens
         image = image_of(message)

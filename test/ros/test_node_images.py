@@ -243,7 +243,24 @@ def test_why_stops_have_no_image_is_told_however_many_images_come(shift, board):
     session.finish()
     assert session.received['measurements'] > 10 * 4
     assert 'at 4 of 4 stops the images are not used' in session.summary
-    assert 'no CameraInfo of it has come on cam/camera_info' in session.summary
+    assert 'no CameraInfo up to its stamp has come on cam/camera_info' in session.summary
+
+
+@pytest.mark.parametrize('together', [False, True])
+def test_images_before_the_first_camera_info_are_not_used(shift, board, together):
+    """However many messages are read at once: live it would not have come yet."""
+    come, given = messages(shift, Image, 5), sources(board, Image)
+    info = next(message for _, message in come if isinstance(message, CameraInfo))
+    late = CameraInfo(distortion_model='plumb_bob', d=info.d, k=info.k)
+    late.header = header(shift[2][2][0], 'camera')
+    come = [each for each in come if each[1] is not info] + [('cam/camera_info', late)]
+    come.sort(key=lambda each: stamp_ns(each[1]))
+    session = directly(come if together else [], given)
+    for topic, message in () if together else come:
+        assert feed(session, [(streams_of(given)[topic], message)], lambda m, kind: m) == []
+    session.finish()
+    assert session.account().samples == 2  # one of the others is blurred
+    assert session.account().dropped['measurements: image before any CameraInfo'] == 2
 
 
 class Slow:
@@ -326,7 +343,7 @@ def test_an_image_that_does_not_fit_its_camera_info_is_refused(shift, board):
     (camera,) = cameras_of(sources(board, Image)).values()
     come = messages(shift, Image, 1)
     info, image = (next(e for _, e in come if isinstance(e, k)) for k in (CameraInfo, Image))
-    assert camera.look(image).reason == 'no CameraInfo of it has come on cam/camera_info'
+    assert camera.look(image).reason == 'no CameraInfo up to its stamp has come on cam/camera_info'
     camera.learn(CameraInfo())
     assert 'not calibrated' in camera.look(image).reason
     camera.learn(info)
