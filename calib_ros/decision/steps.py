@@ -179,10 +179,10 @@ class _Scan:
         problem, names, robust = fitted.problem, fitted.names, fitted.robust
         self._problem, self._chain = problem, robust.fit.chain
         self._groups = _groups(problem) + (_of_the_arm(problem) if loaded else [])
-        loads = [n for group in self._groups if group.kind == 'load' for n in group.names]
-        constant = [name for name in loads if name not in names]
+        constant = [n for g in self._groups if g.kind == 'load' for n in g.names if n not in names]
         self._chain = self._chain.with_effects(constant)
-        constant += [j.driven for j in problem.chain.joints if j.driven not in problem.free]
+        zeros = [joint.driven for joint in problem.chain.joints]
+        constant += [zero for zero in zeros if zero not in problem.free]
         names = (*names, *constant)
         self._fitted = len(names)
         self._added = list(dict.fromkeys(n for group in self._groups for n in group.names))
@@ -203,6 +203,8 @@ class _Scan:
         self._stops = int(number.max(initial=-1)) + 1
         known = replace(few, separations=()).extra_rows(self._chain, fitted.names)
         extra = np.column_stack([np.pad(known[0], ((0, 0), (0, len(constant)))), known[1]])
+        held = [k for k, name in enumerate(names) if name in zeros and name in problem.given]
+        extra = extra[~extra[:, held].any(axis=1)]  # a step may free a zero held too tightly
         self._given = extra.T @ extra  # products of priors
         whole = np.array([gram(rows) for rows in self._rows])
         matrix = whole.sum(axis=0)[: self._fitted, [*range(self._fitted), -1]] + self._given[:-1]
@@ -392,8 +394,6 @@ def _groups(problem: Problem) -> list[_Group]:
             sets = [k for k, each in enumerate(problem.sets) if getattr(each, kind) == frame]
             socket = kind == 'base' and problem.sets[sets[0]].socket  # the ball turns in it
             names = parameters_of(frame)[: 3 if socket else 6]
-            fixed = problem.model.frame(frame).fixed
-            found.append(_Group(frame, kind, names, tuple(sets), fixed))
-    everywhere = tuple(range(len(problem.sets)))
-    joints = problem.chain.joints
+            found.append(_Group(frame, kind, names, tuple(sets), problem.model.frame(frame).fixed))
+    joints, everywhere = problem.chain.joints, tuple(range(len(problem.sets)))
     return found + [_Group(each.name, 'joint', (each.driven,), everywhere) for each in joints]

@@ -135,6 +135,15 @@ def test_a_dozen_positions_show_no_step():
         assert identify(Problem(UR10E, seen, **SIGMAS)).step is None
 
 
+@pytest.mark.parametrize(('slip', 'found'), [(0.0, None), (2e-3, UR10E.joint_names[2])])
+def test_zeros_held_too_tightly_are_no_step_and_hide_none(slip, found):
+    for seed in range(2):
+        true, seen = session(seed)
+        seen = moved(seen, true, 'joint', slip)
+        step = identify(Problem(UR10E, seen, **SIGMAS, priors={'*.theta': 3e-5})).step
+        assert (step and step.what) == found
+
+
 def test_half_of_the_session_called_outliers_hides_no_step():
     true, seen = session(1, oriented=True)
     result = identify(Problem(UR10E, moved(seen, true, 'joint', 0.02, at=40), **SIGMAS))
