@@ -58,7 +58,7 @@ class Status(IntEnum):
 
     NOT_ACCEPTED = 3
     INCOMPLETE = 4
-    """Of a fleet: measurements of some robots could not be used, and no robot needs a look."""
+    """Of a fleet: some measurements or results could not be used, and no robot needs a look."""
 
 
 def refuse_ignored(options: argparse.Namespace, source: str) -> None:

@@ -86,9 +86,15 @@ def _run_history(options: argparse.Namespace, screen: Screen) -> int:
     width = max(map(len, serials))
     columns = 'time (UTC)        what      verdict        poses  RMS [mm]  from'
     screen.data(f'{"robot":{width}}  {columns}')
-    for row in (row for serial in serials for row in history.rows(serial)):
-        rms = '' if row.rms_mm is None else f'{row.rms_mm:.3f}'
-        line = f'{row.serial:{width}}  {row.time:%Y-%m-%d %H:%M}  {row.kind:8}  '
-        line += f'{row.verdict:13}  {row.poses:5}  {rms:>8}  {row.source}'
-        screen.data(line.rstrip())
-    return 0
+    status = 0
+    for serial in serials:
+        try:
+            for row in history.rows(serial):
+                rms = '' if row.rms_mm is None else f'{row.rms_mm:.3f}'
+                line = f'{serial:{width}}  {row.time:%Y-%m-%d %H:%M}  {row.kind:8}  '
+                line += f'{row.verdict:13}  {row.poses:5}  {rms:>8}  {row.source}'
+                screen.data(line.rstrip())
+        except InputError as err:  # costs its robot only
+            screen.warn(f'{serial}: {err}')
+            status = common.Status.INCOMPLETE
+    return status

@@ -50,7 +50,6 @@ class History:
     def file(self, row: Row) -> bool:
         """Add a row; return False if it exists."""
         import pyarrow as pa
-        import pyarrow.parquet as parquet
 
         path = self._path(row.serial, row.key)
         if self._files.exists(path):
@@ -58,10 +57,7 @@ class History:
         values = ((each.name, getattr(row, each.name)) for each in fields(row))
         record = {name: x.ravel() if isinstance(x, np.ndarray) else x for name, x in values}
         table = pa.Table.from_pylist([record | {'key': row.key}], schema=_schema())
-        buffer = io.BytesIO()
-        small = {'use_dictionary': False, 'write_statistics': False}  # most of a file of one row
-        parquet.write_table(table, buffer, compression='zstd', **small)
-        self._write(path, buffer.getvalue())
+        self._write(path, _packed(table))
         return True
 
     def serials(self) -> tuple[str, ...]:
@@ -84,7 +80,8 @@ class History:
         new = sorted(keys.difference(held))
         table = pa.concat_tables([known, *(self._read(serial, key) for key in new)])
         if len(new) >= 8:  # fewer are quick to read again
-            self._cache(serial, table)
+            with suppress(OSError, CalibrationError, NotImplementedError):  # cannot be written
+                self._write(self._cache(serial), _packed(table))
         rows = [row for row in _rows_of(table) if row.key in keys]
         return tuple(sorted(rows, key=lambda row: (row.time, row.source, row.key)))
 
@@ -104,13 +101,10 @@ class History:
 
     def _read(self, serial: str, key: str) -> Any:
         import pyarrow as pa
-        import pyarrow.parquet as parquet
 
         path = self._path(serial, key)
         try:
-            data = pa.BufferReader(self._files.cat_file(path))
-            # threads of pyarrow abort some processes at their end
-            read = parquet.ParquetFile(data).read(use_threads=False)
+            read = _unpacked(self._files.cat_file(path))
             found = pa.Table.from_pylist(read.to_pylist(), schema=_schema())
             if found.column('key').to_pylist() != [key]:
                 raise ValueError('its name is not its key')
@@ -130,26 +124,32 @@ class History:
         self._files.pipe_file(partial, content)
         self._files.mv(partial, path)
 
-    def _cached(self, serial: str) -> Any:
-        import pyarrow as pa
+    def _cache(self, serial: str) -> str:
+        return f'{self._folder(serial, ".cache/")}.rows'
 
-        with suppress(OSError, pa.ArrowException):
-            data = self._files.cat_file(f'{self._folder(serial, ".cache/")}.arrow')
-            alone = pa.ipc.IpcReadOptions(use_threads=False)  # see `_read`
-            table = pa.ipc.open_file(data, options=alone).read_all()
+    def _cached(self, serial: str) -> Any:
+        with suppress(Exception):  # none, or damaged
+            table = _unpacked(self._files.cat_file(self._cache(serial)))
             if table.schema.equals(_schema()):
                 return table
         return _schema().empty_table()
 
-    def _cache(self, serial: str, table: Any) -> None:
-        """Cache the rows, if the history can be written."""
-        import pyarrow as pa
 
-        buffer = io.BytesIO()
-        with pa.ipc.new_file(buffer, table.schema) as writer:
-            writer.write_table(table.combine_chunks())
-        with suppress(OSError, CalibrationError, NotImplementedError):
-            self._write(f'{self._folder(serial, ".cache/")}.arrow', buffer.getvalue())
+def _packed(table: Any) -> bytes:
+    import pyarrow.parquet as parquet
+
+    buffer = io.BytesIO()
+    small = {'use_dictionary': False, 'write_statistics': False}  # most of a file of one row
+    parquet.write_table(table, buffer, compression='zstd', write_page_checksum=True, **small)
+    return buffer.getvalue()
+
+
+def _unpacked(data: bytes) -> Any:
+    import pyarrow as pa
+    import pyarrow.parquet as parquet
+
+    file = parquet.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
+    return file.read(use_threads=False)  # threads of pyarrow abort some processes at their end
 
 
 def is_local(files: Any) -> bool:

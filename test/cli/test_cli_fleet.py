@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import pandas
@@ -64,6 +65,14 @@ def test_identify_and_verify_are_filed(calibrated, capsys):
     assert main(['history', 'history', '--robot', '42']) == 1
     assert 'did you mean "0042"' in capsys.readouterr().err
     assert main(['history', 'nothing']) == 1
+
+    other = History('history')
+    other.file(replace(rows[0], serial='0041'))
+    (calibrated / f'history/robot=0041/{other.rows("0041")[0].key}.parquet').write_bytes(b'PAR1')
+    assert main(['history', 'history']) == Status.INCOMPLETE
+    said = capsys.readouterr()
+    assert said.out.splitlines()[1:] == lines[1:]
+    assert '0041: ' in said.err
 
 
 def test_nights_that_no_file_keeps_are_filed_all_the_same(folder, monkeypatch):

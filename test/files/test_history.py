@@ -108,7 +108,7 @@ def test_what_was_read_before_is_kept_and_never_needed(tmp_path):
     ]
     gone = tmp_path / 'robot=SN%201%2F%C3%B6' / f'{row(3).key}.parquet'
     gone.unlink()
-    kept.write_bytes(kept.read_bytes()[:100])
+    kept.write_bytes(kept.read_bytes().replace(b'SN 1', b'SN 2'))
     left = {each.key for each in store.rows('SN 1/ö')}
     assert left == {each.key for each in first} - {row(3).key} | {row(20).key}
 
@@ -147,6 +147,20 @@ def test_what_is_no_row_is_named(tmp_path, damaged):
         path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(InputError, match=path.name if damaged else 'its name is not its key'):
         store.rows('SN 1/ö')
+
+
+def test_no_flipped_bit_is_read_as_another_number(tmp_path):
+    store = History(tmp_path)
+    numbers = np.random.default_rng(0).normal(size=(12, 12))
+    names = tuple(f'joint.{k}' for k in range(12))
+    store.file(row(names=names, offsets=numbers[0], covariance=numbers))
+    (path,) = tmp_path.rglob('*.parquet')
+    whole = path.read_bytes()
+    begin = whole.index(numbers[4].tobytes())
+    for place in range(begin, begin + 96, 8):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        with pytest.raises(InputError, match=path.name):
+            store.rows('SN 1/ö')
 
 
 def test_serials_and_places_that_cannot_be():
