@@ -84,13 +84,13 @@ class Columns:
         if THOUSANDS.fullmatch(bare):
             remedy = 'write it without the marks between thousands'
             remedy += ', or its decimal point as a comma' * (self.decimal == ',')
-        if DECIMAL_COMMA.fullmatch(bare):
+        if commas := DECIMAL_COMMA.fullmatch(bare) is not None:
             told = f'; if these are thousands, {remedy}' * bool(THOUSANDS.fullmatch(bare))
             remedy = f'write a point or, of measurements, give --decimal comma{told}'
         of_units = row == 0 and bare.lower() not in MISSING and not re.search('[0-9]', bare)
         if of_units:  # perhaps, as other tables have below their header
             remedy += '; units belong into the header: q1 [deg]'
-        return (ColumnsError if of_units else InputError)(
+        return (ColumnsError if of_units or (commas and not row) else InputError)(
             f'{self.where(row, called)} must be a finite number, not {text!r}: {remedy}'
         )
 
@@ -296,7 +296,7 @@ def csv_blocks(
             line = before
             raise csv.Error('unexpected end of data')
     except csv.Error as err:
-        raise InputError(
+        raise (InputError if line else ColumnsError)(  # other separators may suit the header
             f'cannot read {path} from line {above + line + 1}: {err}: are its quotation marks '
             'paired?'
         ) from err

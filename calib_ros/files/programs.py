@@ -46,7 +46,7 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
 
     Columns of held joints may be missing.
     """
-    found, names, _, program = _program(*_columns(path)[:2], chain)
+    found, names, _, program = _program(_columns(path)[0], chain)
     values, _ = joint_values(chain, program)
 
     def remedy(i: int) -> str:
@@ -62,9 +62,9 @@ def _columns(path: Path) -> tuple[Columns, str, str]:
     return with_rows(columns_of(path, text.encode(), separator=separator), ()), separator, text
 
 
-def _with_decimals(found: Columns, names: Sequence[str], separator: str) -> Columns:
+def _with_decimals(found: Columns, names: Sequence[str]) -> Columns:
     cells = (cell for name in names for cell in found.texts(name))
-    return replace(found, decimal=decimal_sign(cells, separator))
+    return replace(found, decimal=decimal_sign(cells))
 
 
 def check_limits(
@@ -102,9 +102,7 @@ def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], st
         )
 
 
-def _program(
-    found: Columns, separator: str, chain: Chain
-) -> tuple[Columns, tuple[str, ...], FloatArray, Program]:
+def _program(found: Columns, chain: Chain) -> tuple[Columns, tuple[str, ...], FloatArray, Program]:
     """Return the table, the columns (n) of all joints with their units, and the program [rad, m].
 
     Columns of held joints may be missing.
@@ -134,7 +132,7 @@ def _program(
         )
     given = [k for k, column in enumerate(columns) if column in found.header]
     named = [columns[k] for k in given]
-    found = _with_decimals(found, named, separator)
+    found = _with_decimals(found, named)
     values = found.block(named) * units[given]
     return found, tuple(columns), units, Program(tuple(joints[k] for k in given), values)
 
@@ -159,8 +157,8 @@ def _units(found: Columns, chain: Chain, columns: Sequence[str]) -> FloatArray:
 
 def read_poses(path: Path) -> FloatArray:
     """Read poses (N, 4, 4) from the columns x y z [m] and qx qy qz qw of a CSV."""
-    table, separator, _ = _columns(path)
-    found = _with_decimals(with_rows(table, POSE_COLUMNS), POSE_COLUMNS, separator)
+    table, *_ = _columns(path)
+    found = _with_decimals(with_rows(table, POSE_COLUMNS), POSE_COLUMNS)
     numbers = found.block(POSE_COLUMNS)
     check_quaternions(found, numbers[:, 3:])
     return se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
@@ -211,7 +209,7 @@ def read_program(path: Path, chain: Chain) -> ProgramFile:
 
 def _read_csv(path: Path, chain: Chain) -> ProgramFile:
     table, separator, text = _columns(path)
-    found, names, units, program = _program(table, separator, chain)
+    found, names, units, program = _program(table, chain)
     signs = joint_columns(len(names), 's')
     known = [k for k, sign in enumerate(signs) if sign in found.header]
     if len({*known, *chain.held}) == len(signs):

@@ -18,8 +18,6 @@ from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.columns import (
     Cells,
@@ -68,7 +66,6 @@ class _Content:
 
     rows: Iterator[list[Cells]]
     notes: list[str]
-    separator: str = ''
     title: str = ''
 
 
@@ -114,7 +111,7 @@ def _of_text(path: Path, layout: Layout) -> _Content:
             f'{path} separates its cells by {name}s: give --separator {name}'
             + ', or to --joints-preset a layout of your own' * bool(layout.source)
         )
-    return _Content(_rows_of_text(path, narrow, separator), notes, separator)
+    return _Content(_rows_of_text(path, narrow, separator), notes)
 
 
 def _rows_of_text(path: Path, text: str, separator: str) -> Iterator[list[Cells]]:
@@ -141,7 +138,7 @@ def _sheet(
     used += [int(name[1:]) - 1 for name in names if name.startswith('#')]
     used += [k for k, cell in enumerate(header) if name_and_unit(cell)[0].lower() in low]
     cells = (row[k] for _, row in head[at + 1 :] for k in used if k < len(row))
-    decimal = layout.decimal or decimal_sign(cells, content.separator)
+    decimal = layout.decimal or decimal_sign(cells)
     if decimal == ',' and not layout.decimal:
         notes.append('numbers have decimal commas (--decimal)')
     first = _first(path, head, at, used, decimal, notes)
@@ -151,24 +148,21 @@ def _sheet(
     above = tuple(tuple(cells) for _, cells in head[: max(at, 0)])
     body = chain([whole[first:]], rows)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
-    if at >= 0:
+    if at >= 0 and max(used, default=0) < len(header):
         _refuse_shifted(columns, len(header))
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(path, header, above, replace(columns, decimal=decimal), tuple(notes))
 
 
 def _refuse_shifted(columns: Columns, width: int) -> None:
-    """Refuse a row with a number more than a header of so many names, if others have none there.
-
-    A thousands mark or a doubled separator may have shifted it; a remark there is text.
-    """
+    """Refuse a row with a number more than a header of so many names; a remark there is text."""
     for name in columns.header[width : width + 1]:
-        filled = ~columns.blank(name)
-        for row in np.flatnonzero(filled)[: not filled.all()].tolist():
-            if _is_number(columns.texts(name)[row], ','):
+        for line, cell in zip(columns.lines.tolist(), columns.texts(name), strict=True):
+            if _is_number(cell, ','):
                 raise InputError(
-                    f'{columns.path}, line {columns.lines[row]}: more numbers than the {width} '
-                    'columns of its header: is there a separator too many, or a thousands mark?'
+                    f'{columns.path}, line {line}: more numbers than the {width} columns of its '
+                    'header: name each column there; a doubled separator, a thousands mark or a '
+                    'decimal comma also makes one more'
                 )
 
 
@@ -189,10 +183,10 @@ def _narrow(text: str, separator: str) -> str:
     return re.sub(r'[ \t]+', ' ', re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text))
 
 
-def decimal_sign(cells: Iterable[str], separator: str) -> str:
+def decimal_sign(cells: Iterable[str]) -> str:
     """Return the decimal sign in cells of numbers."""
     commas = any(DECIMAL_COMMA.fullmatch(c) and not THOUSANDS.fullmatch(c) for c in cells)
-    return ',' if commas and separator != ',' else '.'
+    return ',' if commas else '.'
 
 
 def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tuple[str, ...]:

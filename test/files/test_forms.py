@@ -25,6 +25,8 @@ FORMS = {
     'empty rows of a workbook': PLAIN + ',,,,\n' * 3,
     'a typographic minus': PLAIN.replace('-', '\u2212'),
     'exponents of Fortran': PLAIN.replace('0.25', '2.5D-01'),
+    'decimal commas in quotes': re.sub('[^,\n]+', r'"\g<0>"', PLAIN).replace('.', ','),
+    'a header in quotes': PLAIN.replace('q1', '"q1"').replace(',', ';'),
     'other separators in quotes': 'note,' + PLAIN.replace('\n', '\n"a; b; c; d; e; f, g",', 3),
 }
 
@@ -206,17 +208,23 @@ def test_a_table_beside_a_log_is_not_asked_for_joint_values(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('line', 'said'),
-    [('1,2,3,4,1,234.5', 'is there a separator too many, or a thousands'), ('1,2,3,4,5,hot', '')],
+    ('rows', 'line'),
+    [
+        ('1,2,3,4,5\n1,2,3,4,1,234.5\n1,2,3,4,6\n', 3),
+        ('1,1,2,3,4,5\n2,1,2,3,4,6\n', 2),  # numbered, as R writes them
+        ('P1,1,2,3,4,5\nP2,1,2,3,4,6\n', 2),
+        ('0,1,0,2,0,3,0,4,0,5\n0,2,0,2,0,3,0,4,0,5\n', 2),  # decimal commas
+        ('1,2,3,4,5\n1,2,3,4,5,hot\n1,2,3,4,6\n', 0),
+    ],
 )
-def test_a_row_with_one_number_more_than_the_header_is_refused(tmp_path, line, said):
-    """Its numbers were read one column further, without a word; a remark is none."""
+def test_rows_with_a_number_more_than_the_header_are_refused(tmp_path, rows, line):
+    """Their numbers were read one column further, without a word; a remark is none."""
     path = tmp_path / 'cell.csv'
-    path.write_text(f'q1,q2,x,y,z\n1,2,3,4,5\n{line}\n1,2,3,4,6\n')
-    if not said:
+    path.write_text(f'q1,q2,x,y,z\n{rows}')
+    if not line:
         assert len(read_table(path, 2, foreign=Foreign(Layout())).fitted[0]) == 3
         return
-    with pytest.raises(InputError, match=f'line 3: more numbers than the 5 columns .*{said}'):
+    with pytest.raises(InputError, match=f'line {line}: more numbers than the 5 columns'):
         read_table(path, 2, foreign=Foreign(Layout()))
 
 
