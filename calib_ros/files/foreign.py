@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +46,8 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.effects import coupled
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.values import MOST_NAMES
+
+LEADING_ZEROS = re.compile('(?<![0-9.])0+(?=[0-9])')
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +107,8 @@ class Foreign:
         if len(partners) != len(made.lines):
             raise InputError(
                 f'{log.path} has {len(joints.lines)} rows, {table.path} has {len(made.lines)}: '
-                'give both a column of the same name that names the poses, or a row for each '
-                'measurement'
+                'give both a column that names the poses, or a row for each measurement (rows '
+                'without values do not count)'
             )
         joints = joints.select(partners)
         for ours in filter(re.compile('q[0-9]+').fullmatch, joints.cells):
@@ -239,9 +243,18 @@ class _Table:
         used = {name for each in self._columns.values() for name in each.names}
         return [name for k, name in enumerate(self._sheet.header, 1) if f'#{k}' not in used]
 
-    def texts(self, name: str) -> list[str]:
-        """Return the cells of a column by its name in the header."""
-        return self._sheet.columns.texts(self._sheet.number(name) or '')
+    def labels(self, other: _Table) -> Iterator[tuple[str, str, list[str]]]:
+        """Yield columns that may name the poses of both tables: a kind, the name, and the cells.
+
+        Numbers name them under one name, their kind. Capitals and leading zeros may differ.
+        """
+        theirs = {name.lower() for name in other.header}
+        for k, name in enumerate(self._sheet.header, start=1):
+            cells = self._sheet.columns.texts(f'#{k}')
+            number = math.isfinite(cell_number(next(iter(cells), ''), self._sheet.columns.decimal))
+            if name and (not number or name.lower() in theirs):
+                same = (LEADING_ZEROS.sub('', cell.lower()).removesuffix('.0') for cell in cells)
+                yield name.lower() if number else '', name, [*same]
 
     def columns(self) -> Columns:
         """Return our columns: words, and numbers in m and rad."""
@@ -265,15 +278,25 @@ class _Table:
 def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
     """Return a column that names the poses of both, if any, and the row in the log of each.
 
-    It may have other capitals in the log.
+    If one names most of them, the others are refused.
     """
-    others = {name.lower(): name for name in log.header} | {name: name for name in log.header}
-    for name in table.header:
-        if theirs := others.get(name, others.get(name.lower())):
-            named, logged = table.texts(name), log.texts(theirs)
+    refused = ''
+    for (kind, name, named), (same, theirs, logged) in product(
+        table.labels(log), [*log.labels(table)]
+    ):
+        ours, others = Counter(named), Counter(logged)
+        wrong = [cell for cell in named if ours[cell] != 1 or others[cell] != 1]
+        if kind == same and not wrong:
             rows = {cell: row for row, cell in enumerate(logged)}
-            if len(rows) == len(logged) and len({*named}) == len(named) and {*named} <= {*rows}:
-                return name, np.array([rows[cell] for cell in named])
+            return name, np.array([rows[cell] for cell in named])
+        if kind == same and 2 * len(wrong) < len(named):
+            refused = refused or (
+                f'{table.path}: "{wrong[0]}" of its column {name} must be in one row here and in '
+                f'one of {log.path} (column {theirs}): correct it or leave it out; if all rows '
+                'stand side by side, rename the column in one of them'
+            )
+    if refused:
+        raise InputError(refused)
     return '', np.arange(log.count)
 
 

@@ -213,5 +213,28 @@ def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_h
     ]
     assert 'no units' not in ' '.join(table.warnings)
     (tmp_path / 'log.csv').write_text(log.replace('P4', 'P3'))
-    with pytest.raises(InputError, match=r'has 4 rows, .* has 3: give both a column of the same'):
+    with pytest.raises(InputError, match=r'has 4 rows, .* has 3: give both a column that'):
         read_table(tmp_path / 'points.csv', 2, foreign=given)
+
+
+@pytest.mark.parametrize(
+    ('points', 'log', 'odd'),
+    [
+        ('Point,x,y,z\nP10,1,0,0\nP2,2,0,0\nP1,3,0,0\n', 'Name,q1\np01,3\np10,1\np02,2\n', ''),
+        ('No,x,y,z\n3,1,0,0\n2,2,0,0\n1,3,0,0\n', 'no,q1\n1.0,3\n3.0,1\n2.0,2\n', ''),
+        ('Point,x,y,z\na,1,0,0\nb,2,0,0\nc,3,0,0\n', 'Point,q1\na,1\nb,2\nd,3\n', '"c"'),
+        ('No,x,y,z\n1,1,0,0\n2,2,0,0\n3,3,0,0\n', 'No,q1\n0,1\n1,2\n2,3\n', '"3"'),
+        ('No,x,y,z\n1,1,0,0\n2,2,0,0\n3,3,0,0\n', 'Row,q1\n0,1\n1,2\n2,3\n', ''),
+    ],
+)
+def test_names_of_poses_need_no_column_of_the_same_name(tmp_path, points, log, odd):
+    """Joint values of other poses were taken, row by row, without a word."""
+    (tmp_path / 'log.csv').write_text(log)
+    (tmp_path / 'points.csv').write_text(points)
+    given = Foreign(Layout(), None, tmp_path / 'log.csv')
+    if odd:
+        with pytest.raises(InputError, match=f'{odd} of its column .* must be in one row'):
+            read_table(tmp_path / 'points.csv', 1, foreign=given)
+        return
+    (found,) = read_table(tmp_path / 'points.csv', 1, foreign=given).fitted
+    assert found.joints[:, 0].tolist() == found.positions[:, 0].tolist()
