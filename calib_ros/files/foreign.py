@@ -39,6 +39,9 @@ from calib_ros.files.vocabulary import (
     NUMBERS,
     POSITION,
     QUATERNION,
+    SECONDS,
+    SIGMAS,
+    UNIT_SIGNS,
     WORDS,
     joint_columns,
 )
@@ -182,9 +185,13 @@ class _Table:
             if len(found) > 1 and ours not in (*WORDS, *QUATERNION):
                 continue
             column = only(found, name)
-            bare, _ = name_and_unit(self._sheet.header[column])
-            if JOINT.fullmatch(ours) and ours[0] in 'sva' and bare != name:
+            bare, unit = name_and_unit(self._sheet.header[column])
+            rate = JOINT.fullmatch(ours) and ours[0] in 'sva'
+            if rate and bare != name:
                 continue  # the axes of KUKA are A1, A2, ...: no accelerations
+            other = rate or ours in (*WORDS, *SIGMAS, 'time', 'delay')
+            if other and unit not in (*UNIT_SIGNS, *SECONDS):
+                continue
             number = f'#{column + 1}'
             if ours == 'time' and self._has_dates(number):
                 continue

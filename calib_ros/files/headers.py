@@ -11,7 +11,6 @@ from pathlib import Path
 
 from calib_ros.errors import ColumnsError, InputError
 from calib_ros.files.vocabulary import (
-    LENGTHS,
     NUMBERS,
     POSITION,
     SEPARATORS,
@@ -24,14 +23,26 @@ from calib_ros.shown import some
 
 
 def name_and_unit(cell: str) -> tuple[str, str]:
-    """Return the name of a column, and its unit if the header says it."""
+    """Return the name of a column, and its unit if the header says it, or another in brackets."""
     match = UNIT.fullmatch(cell)
-    return (match[1], UNIT_SIGNS[(match[2] or match[3]).lower()]) if match else (cell, '')
+    if match is None:
+        return cell, ''
+    unit = next(filter(None, match.groups()[1:])).strip()
+    return match[1], UNIT_SIGNS.get(unit.lower(), unit)
 
 
 def places(header: Sequence[str], name: str) -> list[int]:
-    """Return the indices of the columns of a name, with or without its unit."""
-    return [k for k, cell in enumerate(header) if name in (cell, name_and_unit(cell)[0])]
+    """Return the indices of the columns of a name, with or without its unit.
+
+    Those of another form (X_mm), or with something else in brackets, only count if there are none.
+    """
+    parts = [(k, cell, *name_and_unit(cell)) for k, cell in enumerate(header)]
+    usual = [
+        k
+        for k, cell, bare, unit in parts
+        if name == cell or (name == bare and unit in UNIT_SIGNS and cell.endswith((']', ')')))
+    ]
+    return usual or [k for k, _, bare, _ in parts if name == bare]
 
 
 def only(found: Sequence[int], name: str) -> int:
@@ -101,9 +112,6 @@ def named_by_option(
     if whole or like:
         others = {name: found[name] for name in found if name not in of_joints}
         found = {**(like or {'q*': 'NAME*'}), **others}
-    for sign in ('°', 'deg', 'cm', 'mm'):
-        if re.search(rf'(?<!\w){sign}(?!\w)', ' '.join(found.values())):
-            more = f' --{"length" if sign in LENGTHS else "angle"} {UNIT_SIGNS[sign]}{more}'
     given = ','.join(f'{name}={as_typed(each)}' for name, each in found.items())
     options = f'Columns of other names: --columns "{given}"{more}'
     return f'Is it another arm (--chain)? {options}' if fewer else options

@@ -29,7 +29,14 @@ from calib_ros.files.columns import (
 )
 from calib_ros.files.headers import name_and_unit, only, places
 from calib_ros.files.layouts import Layout
-from calib_ros.files.vocabulary import DECIMAL_COMMA, SEPARATORS, SHEETS, THOUSANDS, UNIT_SIGNS
+from calib_ros.files.vocabulary import (
+    DECIMAL_COMMA,
+    MISSING,
+    SEPARATORS,
+    SHEETS,
+    THOUSANDS,
+    UNIT_SIGNS,
+)
 from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, read_bytes
 
@@ -190,9 +197,17 @@ def decimal_sign(cells: Iterable[str]) -> str:
 
 
 def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tuple[str, ...]:
-    """Return the names of columns with their units in the lines below."""
+    """Return the names of columns with their units in the lines below, known and unknown ones."""
     for cells in below:
-        units = [UNIT_SIGNS.get(c.strip('[]() ').lower()) or name_and_unit(c)[1] for c in cells]
+        signs = [cell.strip('[]() ') for cell in cells]
+        units = [
+            UNIT_SIGNS.get(sign.lower()) or name_and_unit(cell)[1]
+            for sign, cell in zip(signs, cells, strict=True)
+        ]
+        if any(sign.lower() in UNIT_SIGNS for sign in signs):  # a line of units, not of names
+            units = [
+                u or s * (s.lower() not in MISSING) for u, s in zip(units, signs, strict=True)
+            ]
         pairs = zip_longest(header, units[: len(header)])
         header = tuple(
             f'{name} [{unit}]' if unit and name and not name_and_unit(name)[1] else name

@@ -73,10 +73,10 @@ class Units:
         self, option: str, given: str, main: Sequence[str], more: Sequence[str]
     ) -> dict[str, str]:
         """Return the units of our columns of a kind: given, in the header, or of the main ones."""
-        what, units, usual = OPTIONS[option]
+        what, _, usual = OPTIONS[option]
         said = {name: self._said(name) for name in (*main, *more) if name in self._columns}
         for name, unit in said.items():
-            self._check(name, unit, units, given)
+            self._check(name, unit, option, given)
         if given:
             self.notes += [
                 f'its header says {unit}, but {given} is given: taking {given}'
@@ -96,16 +96,22 @@ class Units:
             self._assumed.append(f'{what} in {usual} (--{option})')
         return {name: unit or next(iter(found), usual) for name, unit in said.items()}
 
-    def _check(self, ours: str, unit: str, units: Mapping[str, float], given: str) -> None:
-        """Refuse a unit of another kind; note one that an expression may have converted."""
-        each = self._columns[ours]
-        if unit and unit not in units:
+    def _check(self, ours: str, unit: str, option: str, given: str) -> None:
+        """Refuse a unit of another kind, or an unknown one if none is given.
+
+        Note one that an expression may have converted.
+        """
+        each, units = self._columns[ours], OPTIONS[option][1]
+        if unit and unit not in units and not (given and unit not in UNIT_SIGNS):
+            called = ' '.join(map(self._sheet.called, each.names))
+            remedy = 'name the right column (--columns)'
+            if unit not in UNIT_SIGNS:
+                remedy = f'give --{option}, or convert it: --columns {ours}={{{called}}}*FACTOR'
+            elif self._chain is None and ours[0] == 'q':
+                remedy += ', or give --chain if it is prismatic'
             raise InputError(
-                f'{self._sheet.path}: {ours} = {" ".join(map(self._sheet.called, each.names))} '
-                f'cannot be in {unit}, expected {", ".join(units)}: name the right column '
-                '(--columns)'
-                + ', or give --chain if it is prismatic'
-                * (self._chain is None and ours[0] == 'q')
+                f'{self._sheet.path}: {ours} = {called} cannot be in {unit}, expected '
+                f'{", ".join(units)}: {remedy}'
             )
         if unit and not given and not {*each.terms} <= {*each.names}:
             self.notes.append(f'{ours} = {each.text} is in {unit}, as its header says')
@@ -114,6 +120,8 @@ class Units:
         """Return the unit of one of our columns that the header says, `X [mm]`, or empty."""
         each = self._columns[ours]
         found = {name_and_unit(self._sheet.called(name))[1] for name in each.names} - {''}
+        if not {*each.terms} <= {*each.names}:
+            found &= {*UNIT_SIGNS}  # others are converted
         if len(found) > 1:
             raise InputError(
                 f'{self._sheet.path}: {ours} = {each.text} mixes {" and ".join(sorted(found))}, '

@@ -20,8 +20,10 @@ UNIT_SIGNS |= {'°': 'deg', 'µm': 'um', 'μm': 'um', 'inch': 'in', 'inches': 'i
 UNIT_SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
 """Units by their signs and words in small letters."""
 _ANY = '|'.join(UNIT_SIGNS)
-UNIT = re.compile(rf'(.*\S) *(?:[\[(] *({_ANY}) *[\])]|/ *({_ANY}))', re.I)
-"""A name with its unit: X [mm], X (mm), X / mm."""
+_WORDS = '|'.join(sign for sign in UNIT_SIGNS if sign not in ('m', 'in'))
+UNIT = re.compile(rf'(.*[^\s,/_]) *(?:[\[(]([^\[\]()]+)[\])]|[,/] *({_ANY})|[_ ]({_WORDS}))', re.I)
+"""A name with its unit: X [mm], X (mm), X / mm, X_mm; brackets may hold something else."""
+SECONDS = ('', 's', 'sec', 'second', 'seconds')
 
 SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'space': ' '}
 DECIMAL_COMMA = re.compile(r'\s*[+\u2212-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')

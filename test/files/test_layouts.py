@@ -79,7 +79,7 @@ def test_what_is_no_expression(text):
 @pytest.mark.parametrize(
     ('names', 'proposed'),
     [
-        (['A1_rad', 'A2_rad', 'x', 'y', 'z'], 'Columns of other names: --columns "q*=A*_rad"'),
+        (['A1_rad', 'A2_rad', 'x', 'y', 'z'], 'Columns of other names: --columns "q*=A*"'),
         (
             ['Joint 1 [rad]', 'Joint 2 [rad]', 'X [m]', 'y', 'z'],
             'Columns of other names: --columns "q*={Joint *}"',
@@ -130,6 +130,7 @@ def test_a_linear_axis_has_its_own_unit_in_the_header(tmp_path):
         ('q1,q2,x,y,z\nDegrees,Degrees,inches,millimeter,Meters', '90,180,.03937007874,2,.003'),
         ('q1 [deg],q2 [rad],x [mm],y [m],z [cm]', '90,3.141592653589793,1,.002,.3'),
         ('q1 [rad],q2 [rad],x [mm],y,z,rx [deg],ry,rz', '1.5707963268,3.1415926536,1,2,3,90,0,0'),
+        ('q1_deg,"q2, deg",x mm,Y_MM,"z,mm"', '90,180,1,2,3'),
         ('Cell\na [deg],b,c [mm],d,e', '90,180,1,2,3'),
         ('Cell\na,b,c,d,e\ndeg,deg,mm,mm,mm', '90,180,1,2,3'),
     ],
@@ -157,6 +158,8 @@ def test_each_column_has_its_own_unit(tmp_path, head, row):
             r'q1 = q1 \[mm\] cannot be in mm, .* --chain if it is prismatic',
         ),
         ('q1,q2,x [deg],y,z', r'x = x \[deg\] cannot be in deg, expected m, cm'),
+        ('q1,q2,x [ft],y,z', r'x = x \[ft\] cannot be in ft, .*: give --length, or convert it'),
+        ('q1,q2,x,y,z\nrad,rad,ft,mm,mm', r'x = x \[ft\] cannot be in ft, .*: give --length, or'),
         ('q1,q2,x [mm],y [m],z', 'z has no unit, others are in m and mm'),
         ('q1,q2,x [mm],x,y', 'Several columns are called x'),
         ('q1,Y [m],X [mm],y,z', r'x = X\+Y mixes m and mm'),
