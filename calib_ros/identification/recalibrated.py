@@ -73,12 +73,13 @@ class Recalibration(Shown):
     def determined(self) -> bool:
         """Tell whether other poses confirm a change or new frames, and the arm is known enough.
 
-        About as well as before, or far better than it changed.
+        About as well as before, or both poses and arm far better than they changed.
         """
-        usual = max(1e3 * (self.calibration.residual or np.inf), self.fitted_mm)
-        confirmed = self.after.rms_mm < (self.before.rms_mm if self.changed else CLEARLY * usual)
-        known = self.known_after <= max(ALIKE * self.known_before, self.moved / CLEARLY)
-        return confirmed and known
+        after, before = self.after.rms_mm, self.before.rms_mm
+        usual = CLEARLY * max(1e3 * (self.calibration.residual or np.inf), self.fitted_mm)
+        clearly = after < max(usual, before / CLEARLY)
+        most = max(ALIKE * self.known_before, clearly * self.moved / CLEARLY)
+        return after < (before if self.changed else usual) and self.known_after <= most
 
     @property
     def outside(self) -> Explanation | None:

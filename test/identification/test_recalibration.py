@@ -18,6 +18,7 @@ from calib_ros.errors import InputError
 from calib_ros.identification.calibration import parse_calibration
 from calib_ros.identification.recalibrated import ANEW
 from calib_ros.identification.recalibration import years_since
+from calib_ros.kinematics import se3
 
 Q = UR10E.random_joints(300, np.random.default_rng(99))
 
@@ -224,6 +225,25 @@ def test_poses_too_much_alike_to_show_what_has_changed_are_not_enough(earlier):
     assert not found.accepted
     assert 'do not show well enough what has changed' in found.refusal()[0]
     assert recalibrate(previous, problem(now, 8, 2), 0.1).accepted
+
+
+@pytest.mark.parametrize('seed', [73, 147])
+def test_two_bent_links_do_not_explain_a_device_and_a_target_that_moved(earlier, seed):
+    """Four positions fit them, but do not predict each other: the arm would be 4 to 29 mm off."""
+    true, previous = earlier
+    rng = np.random.default_rng(seed)
+
+    def moved(millimetres, milliradians):
+        shift, turn = rng.normal(size=(2, 3)) * [[1e-3 * millimetres], [1e-3 * milliradians]]
+        return se3.transform(se3.exp_rotation(turn), shift)
+
+    base = replace(true.base, matrix=moved(1.0, 1.0) @ true.base.matrix)
+    tool = replace(true.tool, matrix=true.tool.matrix @ moved(5.0, 10.0))
+    seen = problem(replace(true, base=base, tool=tool), 4, seed, oriented=False)
+    found = recalibrate(previous, seen, 0.1)
+    assert found.moved > 3e-3
+    assert found.after.rms_mm < found.before.rms_mm
+    assert not found.accepted
 
 
 @pytest.mark.parametrize('seed', [3, 8, 10, 13])
