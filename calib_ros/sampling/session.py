@@ -128,8 +128,7 @@ class CalibrationSession:
         self._pipeline.hand_over()
         self._settle(wait=True)
         taken = len(self.samples) - before
-        if JOINTS in self._filter.refused:
-            why = self.state
+        why = self.state if JOINTS in self._filter.refused else why
         return (taken, why) if taken or not count else (0, self.pictures.refused)
 
     def remove_last(self) -> Sample:
