@@ -257,7 +257,8 @@ def test_images_before_the_first_camera_info_are_not_used(shift, board, together
     come.sort(key=lambda each: stamp_ns(each[1]))
     session = directly(come if together else [], given)
     for topic, message in () if together else come:
-        assert feed(session, [(streams_of(given)[topic], message)], lambda m, kind: m) == []
+        batch = [(streams_of(given)[topic], serialize_message(message))]
+        assert feed(session, batch, deserialised) == []
     session.finish()
     assert session.account().samples == 2  # one of the others is blurred
     assert session.account().dropped['measurements: image before any CameraInfo'] == 2
