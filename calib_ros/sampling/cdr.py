@@ -117,12 +117,12 @@ def message_layout(kind: str, blob: bytes) -> MessageLayout:
     texts, between, numbers, count = FORMS[kind]
     read, size = _Reader(blob), int(numbers[1:])
     parts, begins = list[tuple[str, ...]](), list[tuple[int, int]]()
-    for _ in range(read.integer() if kind == TRANSFORMS else 1):
+    for _ in range(read.count() if kind == TRANSFORMS else 1):
         stamp = _aligned(read.at, 4)
         read.at = stamp + 8
         strings = [read.string() for _ in range(texts)]
         if kind == JOINT_STATE:
-            strings += [read.string() for _ in range(read.integer())]
+            strings += [read.string() for _ in range(read.count())]
             count = read.integer()
             if len(strings) != count + 1:
                 raise MessageError('names and positions differ in number')
@@ -165,8 +165,17 @@ class _Reader:
     def integer(self) -> int:
         begin = _aligned(self.at, 4)
         self.at = begin + 4
+        if self.at > len(self._blob):
+            raise struct.error('it is cut off')
         self.named.append(slice(begin, self.at))
         return int(struct.unpack_from(f'{self._order}I', self._blob, begin)[0])
+
+    def count(self) -> int:
+        """Return the number of texts or transforms that follow."""
+        count = self.integer()
+        if self.at + 4 * count > len(self._blob):  # the least that they take
+            raise struct.error('it is cut off')
+        return count
 
     def string(self) -> str:
         """Return a zero-terminated text."""

@@ -1,5 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import struct
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
@@ -15,7 +17,7 @@ from recorded import (
     transform_stamped,
 )
 
-from calib_ros.sampling.cdr import alike, trajectory_size
+from calib_ros.sampling.cdr import alike, message_layout, trajectory_size
 from calib_ros.sampling.message_filter import usable
 from calib_ros.sampling.messages import JOINT_STATE, MEASURES, head_of
 from calib_ros.sampling.slices import Part
@@ -126,6 +128,14 @@ def test_layouts_without_end_are_decoded_and_not_kept():
     found = alike(JOINT_STATE, blobs, known)
     assert [strings[1] for _, strings, *_ in found] == [f'{k:03d}' for k in range(60)]
     assert sum(map(len, known.values())) == 10
+
+
+def test_a_message_with_more_names_than_bytes_is_refused_before_they_are_read():
+    blob = joint_blob(['aa', 'bb'], [1.0, 2.0]).replace(b'aa', b'\xff\xff')
+    with pytest.raises(UnicodeDecodeError):
+        message_layout(JOINT_STATE, blob)
+    with pytest.raises(struct.error, match='cut off'):
+        message_layout(JOINT_STATE, blob[:20] + b'\xff\xff\xff\x7f' + blob[24:])
 
 
 @pytest.mark.parametrize('cut', [3, 9, 14, 30, -9, -1])
