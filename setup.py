@@ -23,7 +23,7 @@ DOCS = ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.24']
 XLSX = 'openpyxl>=3.1.2'
 CAMERA = 'opencv-python-headless>=4.7'
 TERMINAL = ['argcomplete>=3.1.4', 'rich>=13.7.1']
-FLEET = ['distributed>=2024.5.0', 'fsspec>=2024.2.0', 'pyarrow>=14.0.1']
+FLEET = ['distributed>=2024.5.0', 'fsspec>=2024.2.0', 'pyarrow>=15.0.0']
 
 setup(
     name=NAME,
