@@ -291,12 +291,14 @@ def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
     for (kind, name, named), (same, theirs, logged) in product(
         table.labels(log), [*log.labels(table)]
     ):
+        if kind != same:
+            continue
         ours, others = Counter(named), Counter(logged)
         wrong = [cell for cell in named if ours[cell] != 1 or others[cell] != 1]
-        if kind == same and not wrong:
+        if not wrong:
             rows = {cell: row for row, cell in enumerate(logged)}
             return name, np.array([rows[cell] for cell in named])
-        if kind == same and 2 * len(wrong) < len(named):
+        if 2 * len(wrong) < len(named):
             refused = refused or (
                 f'{table.path}: "{wrong[0]}" of its column {name} must be in one row here and in '
                 f'one of {log.path} (column {theirs}): correct it or leave it out; if all rows '
