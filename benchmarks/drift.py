@@ -7,9 +7,10 @@
 Simulated UR10e, measured along a path through 12 way-points (all of the joint range, or +-0.8 rad)
 with noise of 0.05 mm and 0.2 mrad, by a tracker that drifts by 0.3 mm: errors that fade over 10
 poses, a random walk, a swing of about one period, a ramp. Of arms without any error none should be
-accepted; of arms with errors of 0.5 mm and 1 mrad all should be. `effects`: arms with such errors,
-on which `auto` chose an effect that is not there. `coverage_95`: how many 95 % intervals of their
-DH parameters hold the truth; `independent`: without regard to what neighbours share.
+accepted; of arms with errors of 0.5 mm and 1 mrad all should be, but for those whose lengths grew
+or shrank alike by chance, as with a device out of scale (`like_scale`). `effects`: arms with such
+errors, on which `auto` chose an effect that is not there. `coverage_95`: how many 95 % intervals
+of their DH parameters hold the truth; `independent`: without regard to what neighbours share.
 """
 
 import argparse
@@ -23,6 +24,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify, identify_model
 from calib_ros.kinematics.chain_file import load_chain
@@ -105,6 +107,9 @@ def main():
                     'runs': runs,
                     'healthy_accepted': sum(result.accepted for result in healthy),
                     'faulty_accepted': sum(result.accepted for result in results),
+                    'like_scale': sum(
+                        reason.rule is Rule.SCALE for r in results for reason in r.refusals
+                    ),
                     'effects': sum(bool(result.chain.effects) for result in chosen),
                     'effects_runs': len(chosen),
                     'coverage_95': round(float(covered.mean()), 3),
@@ -113,8 +118,8 @@ def main():
                 rows.append(row)
                 if not options.json:
                     print(', '.join(f'{key} {value}' for key, value in row.items()), flush=True)
-    keys = ('runs', 'healthy_accepted', 'faulty_accepted', 'effects', 'effects_runs')
-    total = {key: sum(row[key] for row in rows) for key in keys}
+    keys = ('runs', 'healthy_accepted', 'faulty_accepted', 'like_scale', 'effects')
+    total = {key: sum(row[key] for row in rows) for key in (*keys, 'effects_runs')}
     for key in ('coverage_95', 'independent'):
         total[key] = float(np.mean([row[key] for row in rows]))
     if options.json:
