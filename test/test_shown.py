@@ -8,6 +8,7 @@ import pkgutil
 import re
 import sys
 from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,6 +49,15 @@ def test_a_value_fits_on_a_screen(value):
         (lambda: calib_ros.Calibration.of(CHAIN), 'result must be of type Identification'),
         (lambda: calib_ros.Compensator(CHAIN, ARM), 'calibrated must be of type Chain, not Cal'),
         (lambda: calib_ros.CalibrationSession('ur10e'), 'chain must be of type Chain, not str'),
+        (lambda: Design.of(RESULT), 'problem must be of type Problem, not Identification'),
+        (lambda: calib_ros.recalibrate(ARM, RESULT, 1.0), 'problem must be of type Problem'),
+        (lambda: calib_ros.recalibrate(ARM, PROBLEM, 1.0, new='tool'), 'unknown frame "t"'),
+        (
+            lambda: calib_ros.corrected_urdf('<robot/>', ARM),
+            'chain must be of type Chain, not Cal',
+        ),
+        (lambda: calib_ros.chain_from_urdf(Path('a')), 'text must be of type str, not PosixPath'),
+        (lambda: calib_ros.dump_chain(ARM), 'chain must be of type Chain, not Calibration'),
     ],
 )
 def test_arguments_of_another_type_are_named(call, said):

@@ -26,6 +26,7 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.sampling.live import Estimate
 from calib_ros.settings import LEVER
 from calib_ros.shown import Shown
+from calib_ros.values import require
 
 ASSUMED_TOOL = 3 * (LEVER / 3.0,)
 """Assumed place of an unknown target [m] in the flange frame: on its axis, where an identity frame
@@ -54,6 +55,7 @@ class Design(Shown):
         further poses have its noise. Measured values do not count otherwise: `simulation.measure`
         can make the observations of a problem before anything is measured. Distances are refused.
         """
+        require(Problem, problem=problem)
         kind = problem.kinds[0]
         if kind.distance or problem.separations:
             raise InputError('planning needs measured poses or positions, not distances')

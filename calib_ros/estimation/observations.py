@@ -273,11 +273,13 @@ class Observations(Shown):
 
 
 def _numbers(name: str, values: object) -> FloatArray:
-    """Return values as an array, masked ones as NaN."""
+    """Return a copy of real numbers as an array, masked ones as NaN."""
     try:
-        array = np.ma.asarray(values, dtype=np.float64)
+        if (kind := np.asanyarray(values).dtype).kind not in 'iufO':
+            raise TypeError(f'they are {kind}')
+        array = np.ma.array(values, dtype=np.float64, copy=True)
     except (TypeError, ValueError) as err:
-        raise InputError(f'{name} must be numbers in an array: {err}') from err
+        raise InputError(f'{name} must be real numbers in an array: {err}') from err
     return np.asarray(array.filled(np.nan)) if np.ma.is_masked(array) else np.asarray(array.data)
 
 

@@ -73,6 +73,7 @@ def recalibrate(
     InputError if the calibration has no covariance or lacks a frame, or for a mistake.
     """
     require(Calibration, previous=previous)
+    require(Problem, problem=problem)
     if mistake := mistakes.explained(problem, far=True):
         raise InputError(f'the new poses do not fit the arm: {mistake}')
     try:
@@ -138,8 +139,7 @@ def _recalibrated(
     arm, system = _Arm.of(previous, sets, years, growth), _system(problem, sets, previous)
     # corrected axes are never quite parallel
     nominal = previous.before.with_effects([name for name, _ in arm.chain.effects])
-    free = (frame for frame in new if not arm.chain.frame(frame).fixed)
-    own = [name for frame in free for name in parameters_of(frame)]
+    own = [n for end in new if not arm.chain.frame(end).fixed for n in parameters_of(end)]
     anywhere = 10.0 * changes.shown(nominal, arm.names, own)  # m, rad
     if anywhere.size:
         chain = in_new_frames(problem, arm.chain, new, system)

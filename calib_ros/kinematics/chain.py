@@ -216,6 +216,8 @@ class Chain(Shown):
 
     def frame(self, name: str) -> Frame:
         """Return a base or tool frame; the identity if unknown."""
+        if name not in self.all_frames:
+            raise UnknownNameError('frame', name, self.frame_names)
         return self.all_frames[name] or ANYWHERE
 
     def owns_frame(self, parameter: str) -> bool:

@@ -37,6 +37,7 @@ from calib_ros.values import (
     parse_name,
     parse_number,
     parse_numbers,
+    require,
 )
 
 CHAIN_KEYS = (
@@ -248,6 +249,7 @@ def dump_chain(chain: Chain, calibration: Mapping[str, Any] | None = None) -> st
 
     The hash of its table ends it: a file that was cut off has none.
     """
+    require(Chain, chain=chain)
     document = chain_document(chain)
     if calibration is not None:
         ordered = sorted(calibration.items(), key=lambda each: each[0] == 'table_sha256')

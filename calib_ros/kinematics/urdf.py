@@ -40,7 +40,7 @@ from calib_ros.kinematics.chain import (
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, edited, parse_urdf
 from calib_ros.settings import Settings
-from calib_ros.values import MOST_NAMES, SAME
+from calib_ros.values import MOST_NAMES, SAME, require
 
 MOST_APART = 2.0 * Settings.largest_angle
 """Mean pose difference [m or rad] at which a chain is not the arm of a URDF."""
@@ -65,6 +65,7 @@ def chain_from_urdf(
 
     Raises ConfigError if the text is not a URDF, or no serial chain connects the links.
     """
+    require(str, text=text)
     robot = parse_urdf(text)
     path = robot.path(base_link, tip_link)
     poses = robot.poses(path[0].parent)
@@ -116,6 +117,7 @@ def corrected_urdf(
     Raises ConfigError if the chain is not of this arm, or has effects beyond these couplings,
     which a URDF cannot represent.
     """
+    require(Chain, chain=chain)
     nominal = chain_from_urdf(text, base_link, tip_link, chain.convention)
     arm = replace(chain, base=nominal.base, tool=nominal.tool, frames=())
     _refuse_others(arm, nominal)

@@ -46,7 +46,11 @@ MASKED = np.ma.masked_array(THREE, mask=[[0, 0, 0], [0, 1, 0], [0, 0, 0]])
         *(((SIX + bad, THREE), 'joints .* NaN or infinite') for bad in (np.nan, np.inf)),
         *(((SIX, THREE + bad), 'positions .* NaN or infinite') for bad in (np.nan, np.inf)),
         ((SIX, MASKED), 'positions of the observations hold NaN'),
-        (([['a'] * 6], [[0.0] * 3]), 'joints must be numbers'),
+        (([['a'] * 6], [[0.0] * 3]), 'joints must be real numbers'),
+        *(
+            ((SIX, THREE.astype(kind)), f'real numbers in an array: they are {kind}')
+            for kind in ('bool', 'complex128', 'datetime64', '<U3')
+        ),
         *(
             (arrays, r'joints must have the shape \(N, n\)')
             for arrays in ((None, None), (1.0, 2.0), ([0.0] * 6, [0.0] * 3), ([], []))
@@ -64,6 +68,13 @@ MASKED = np.ma.masked_array(THREE, mask=[[0, 0, 0], [0, 1, 0], [0, 0, 0]])
 def test_arrays_that_cannot_be_are_refused(arrays, complaint):
     with pytest.raises(InputError, match=complaint):
         Observations.from_arrays(*arrays)
+
+
+def test_observations_do_not_follow_arrays_that_change():
+    joints = SIX.copy()
+    seen = Observations.from_arrays(joints, THREE)
+    joints += 1.0
+    assert not np.array_equal(seen.joints, joints)
 
 
 def test_lists_will_do_as_arrays(rng):
