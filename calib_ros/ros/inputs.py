@@ -27,7 +27,7 @@ from rclpy.subscription import Subscription
 
 from calib_ros.errors import ConfigError
 from calib_ros.sampling.batches import BATCH, Stream, links_of
-from calib_ros.sampling.messages import PICTURES
+from calib_ros.sampling.messages import CAMERA_INFO, PICTURES
 from calib_ros.sampling.slices import NO_ACCIDENT, SILENCE
 from calib_ros.settings import EXCEPTION
 
@@ -114,6 +114,7 @@ class Inputs:
         self.failures: list[str] = []
         """Why topics give nothing, as text, at the last look."""
         self._inputs = dict(self._subscribe(stream) for stream in streams)
+        self._not_latched = [stream for stream in streams if stream.type == CAMERA_INFO]
         self._events = dict.fromkeys((e for each in self._inputs for e in each.event_handlers), 0)
 
     def __contains__(self, entity: object) -> bool:
@@ -138,6 +139,7 @@ class Inputs:
 
     def look(self) -> None:
         """Note losses, silence, rates and failures since the last look."""
+        self._subscribe_to_latched()
         for event, known in self._events.items():
             event.add_to_wait_set(_Due())
             event.is_ready(_Due())
@@ -207,6 +209,26 @@ class Inputs:
             raise ConfigError(f'the depth of qos_overrides for "{stream.topic}" must be >= 1')
         return subscription, (stream, hearing)
 
+    def _subscribe_to_latched(self) -> None:
+        """Subscribe to each CameraInfo that is latched: it may have been published long ago.
+
+        That subscription hears no others, and their publishers would log warnings about it.
+        """
+        for stream in tuple(self._not_latched):
+            topic = self._node.resolve_topic_name(stream.topic)
+            infos = self._node.get_publishers_info_by_topic(topic)
+            if DurabilityPolicy.TRANSIENT_LOCAL in (i.qos_profile.durability for i in infos):
+                self._not_latched.remove(stream)
+                subscription = self._node.create_subscription(
+                    _message_type(stream.type),
+                    stream.topic,
+                    lambda data: None,
+                    _qos(stream, latched=True),
+                    event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+                    raw=True,
+                )
+                self._inputs[subscription] = stream, Hearing()  # the other one counts
+
     def _of_other_types(self) -> list[str]:
         found = set()
         for subscription, (stream, hearing) in self._inputs.items():
@@ -233,12 +255,13 @@ def _waiting(subscription: Subscription) -> list[tuple[int, bytes]]:
     return found
 
 
-def _qos(stream: Stream) -> QoSProfile:
+def _qos(stream: Stream, latched: bool = False) -> QoSProfile:
     """Return the QoS of a topic; a new one each time, because overriding changes it."""
+    latched = latched or stream.still
     return QoSProfile(
         depth=IMAGE_QUEUE if stream.type in PICTURES else QUEUE,
-        reliability=ReliabilityPolicy.RELIABLE if stream.still else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if stream.still else DurabilityPolicy.VOLATILE,
+        reliability=ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
 from recorded import TYPES, serialised, write
-from ros_cell import PATIENCE, START, Cell, header, joint_messages, stamp_ns
+from ros_cell import LATCHED, PATIENCE, START, Cell, header, joint_messages, stamp_ns
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
 
 from calib_ros.apply.simulation import (
@@ -198,6 +198,21 @@ def test_direct_bag_and_live_give_equal_corners(tmp_path, shift, truth, board):
     assert_same(wanted, live.problem_of(kept).observations)
     (fitted,) = read_table(journal, 6).fitted
     assert_same(wanted, fitted)
+
+
+def test_a_latched_camera_info_of_before_the_start_is_heard(tmp_path, shift, board):
+    """Cameras that read it from a file publish it once, and the node heard none of it."""
+    topic, info = messages(shift, Image, 0)[0]
+    with Cell() as cell:
+        cell.peer.create_publisher(CameraInfo, topic, LATCHED).publish(info)
+        node = cell.start(
+            chain='ur10e', sources=list(sources(board, Image)), data_dir=str(tmp_path)
+        )
+        camera = node.session.pictures.cameras[TOPICS[Image]]
+        cell.spin_until(lambda: camera._told)
+        assert camera._told[0].lens.fx == LENS.fx
+        served = {*node.subscriptions, *node.waitables}
+        assert served.isdisjoint(s for s in node._subscriptions if s.topic_name == f'/{topic}')
 
 
 def test_compressed_images_of_a_bag_and_of_messages(tmp_path, shift, board):
