@@ -28,7 +28,9 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from calib_ros.atomic import given_path
+from calib_ros.decision.comparison import compare
 from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.cameras import cameras_of
@@ -121,7 +123,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             (Trigger, '~/cancel', lambda request: self._identifying.progress.cancel()),
             (Trigger, '~/capture', self._on_capture),
             (Trigger, '~/remove_last', self._on_remove_last),
-            (Trigger, '~/validate', self._on_validate),
             (Trigger, '~/clear', self._on_clear),
             (Trigger, '~/load', self._on_load),
             (SetBool, '~/record', self._on_record),
@@ -133,6 +134,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             ('~/export', self._keeper.exportable, self._keeper.export),
             ('~/save', self._keeper.to_save, self._on_save),
             ('~/check', self.session.recent, self._on_check),
+            ('~/validate', self._to_judge, self._on_validate),
         )
         return [
             DeferredTrigger(self, name, self._answer, partial(self._up_to_now, begin), work)
@@ -282,14 +284,20 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self.session.remove_last()
         return True, f'pose {len(self.session.samples) + 1} removed'
 
-    def _on_validate(self, request: Any) -> Answer:
-        session, found = self.session, self.session.validate()
+    def _to_judge(self) -> tuple[Calibration, list[Observations], Callable[..., str]]:
+        session = self.session
         calibration, sets = session.since()
+        problem = partial(session.problem_of, session.usable)
+        return calibration, sets, partial(self._filer.file, problem, session.settings)
+
+    def _on_validate(
+        self, given: tuple[Calibration, list[Observations], Callable[..., str]]
+    ) -> Answer:
+        calibration, sets, filed = given
+        found = compare(calibration.before, calibration.chain, sets)
         verdict, text = words.verdict(calibration, found, calibration.reused(sets), sets)
         row = partial(judged, calibration.chain, *found.figures, verdict)
-        known = table_hash(calibration.chain)
-        filed = self._filer.file(session.problem, session.settings, row, known)
-        return verdict == 'holds', text + filed
+        return verdict == 'holds', text + filed(row, table_hash(calibration.chain))
 
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:
         calibration, problem = found

@@ -10,6 +10,7 @@ from ros_cell import PATIENCE, STOPS, Cell, topics
 from std_msgs.msg import String
 
 from calib_ros.files import loading
+from calib_ros.files.history import History
 from calib_ros.identification.identification import identify
 
 
@@ -51,6 +52,37 @@ def test_messages_are_taken_while_an_identification_runs(tmp_path, recording, he
         assert 'too few poses to tell whether the calibration holds' in judged.message
         assert '4 poses measured since' in judged.message
         cell.done('identify')
+
+
+def test_messages_are_taken_while_a_judgement_is_filed(tmp_path, recording, monkeypatch):
+    """The node stood still until a slow history had answered."""
+    filing, release, rows = threading.Event(), threading.Event(), []
+
+    def slow(history, row):
+        rows.append(row)
+        filing.set()
+        assert release.wait(PATIENCE)
+
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': '7'}
+    with Cell(**parameters, history=str(tmp_path / 'history')) as cell:
+        messages = topics(recording)
+        cell.play(messages)
+        cell.done('identify')
+        cell.done('clear')
+        cell.play(messages)
+        monkeypatch.setattr(History, 'file', slow)
+        judging = cell.start_call('validate')
+        cell.spin_until(filing.is_set)
+        count = cell.node.session.received['joints']
+        cell.play({'joint_states': messages['joint_states'][-10:]})
+        assert cell.node.session.received['joints'] == count + 10
+        cell.done('clear')
+        assert not judging.done()
+        assert 'running' in cell.refused('validate').message
+        release.set()
+        cell.spin_until(judging.done)
+        assert f'{STOPS} poses' in judging.result().message
+        assert [row.kind for row in rows] == ['validate']
 
 
 STAGES = ['model geometric', 'effects', 'effects: ratio', 'harmonics of elbow_joint']
