@@ -17,7 +17,7 @@ from visualization_msgs.msg import MarkerArray
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
-from calib_ros.errors import LONGEST, CalibrationError, ConfigError, InputError, shortened
+from calib_ros.errors import LONGEST, ConfigError, InputError, shortened
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.history import History
@@ -72,7 +72,7 @@ class Filer:
                 hashed = settings_hash(self._nominal, settings, *judged)
                 about = Filing(self.serial, measured_at(sets), samples_hash(sets), hashed)
                 self._history.file(row(about))
-        except (CalibrationError, OSError) as err:
+        except Exception as err:  # of the network too: the result is told all the same
             return f'{NOT_FILED} in the history: {err}'
         return ''
 

@@ -85,6 +85,19 @@ def test_messages_are_taken_while_a_judgement_is_filed(tmp_path, recording, monk
         assert [row.kind for row in rows] == ['validate']
 
 
+def test_a_result_is_told_although_its_history_fails(tmp_path, recording, monkeypatch):
+    """Clients of remote storage raise errors of their own: an accepted result seemed refused."""
+
+    def fail(history, row):
+        raise ZeroDivisionError('no credentials')
+
+    monkeypatch.setattr(History, 'file', fail)
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': '7'}
+    with Cell(**parameters, history=str(tmp_path / 'history')) as cell:
+        cell.play(topics(recording))
+        assert 'no credentials' in cell.in_full(cell.done('identify'))
+
+
 STAGES = ['model geometric', 'effects', 'effects: ratio', 'harmonics of elbow_joint']
 
 
