@@ -87,7 +87,9 @@ class CalibrationSession:
         check_settings(self.chain, settings)
         self.settings = settings
         self._collector.settings = self._clocks.settings = settings
-        self._frames.wanted = frame_name(settings.frame_id)
+        if self._frames.wanted != frame_name(settings.frame_id):
+            self._frames.wanted = frame_name(settings.frame_id)
+            self._filter.refused.pop(POSES, None)
         self._relearn()
 
     def _relearn(self) -> None:
@@ -208,9 +210,8 @@ class CalibrationSession:
         if left_out := len(self.samples) - len(usable):
             notes['poses left out, in another frame or of a target measured once'] += left_out
         if missed := self._names.missed:
-            notes[f'joint that moves but is not in the chain: {", ".join(some(missed))}'] = len(
-                missed
-            )
+            names = ', '.join(some(missed))
+            notes[f'joint that moves but is not in the chain: {names}'] = len(missed)
         return Account(
             joint_states=self.received[JOINTS],
             poses=self.received[POSES],
@@ -357,16 +358,15 @@ class CalibrationSession:
         calibration, sets = self.since(NO_ACCIDENT)
         cameras = {each.camera for each in sets if each.pixels is not None}
         seen = {name: lens for name in cameras if (lens := calibration.chain.frame(name).lens)}
-        return calibration, Dataset(sets, lenses=seen).problem(self.chain, self.settings)
+        problem = Dataset(sets, lenses=seen).problem(self.chain, self.settings, of_messages=True)
+        return calibration, problem
 
-    def since(self, most: int | None = None) -> tuple[Calibration, list[Observations]]:
+    def since(self, most: int = 0) -> tuple[Calibration, list[Observations]]:
         """Return the calibration, and the samples since then in its frames, the last `most`."""
-        calibration = self.calibration
-        if calibration is None:
+        if (calibration := self.calibration) is None:
             raise InputError('there is no calibration to judge: identify or load one first')
         self._flush()
-        since = [each for each in self.usable if each not in self._known]
-        since = since[-most:] if most else since
+        since = [each for each in self.usable if each not in self._known][-most:]
         # without owners, the first device and target have the frames
         frames = Frames(calibration.owners) if calibration.owners else named(self.usable)
         sets = [each for _, each in collect(since, self.settings.sigmas, frames)]

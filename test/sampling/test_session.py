@@ -72,6 +72,16 @@ def test_a_leading_slash_makes_no_other_frame():
     assert len(made.samples) == 16
 
 
+def test_a_frame_id_that_was_set_right_is_no_longer_told_as_wrong():
+    made = CalibrationSession(UR5E, Settings(frame_id='elsewhere'))
+    drive(made, 4, [tracker()])
+    assert 'measurements are refused' in made.status()
+    made.change(replace(made.settings, sigma_position=1e-4))
+    assert 'measurements are refused' in made.status()
+    made.change(replace(made.settings, frame_id='/tracker'))
+    assert 'measurements are refused' not in made.status()
+
+
 @pytest.mark.parametrize('where', [0, 100])
 def test_a_stray_frame_is_counted_and_the_others_are_identified(where):
     """Also of the first measurement, which would make a sample of its own."""
@@ -294,6 +304,7 @@ def test_what_was_there_before_does_not_judge():
     drive(made, 4, [tracker()])
     _, now = made.validate().figures
     assert now.count == 4
+    assert made.recent()[1].of_messages  # so that advice names topics, not columns
 
 
 def test_the_calibration_of_another_robot_is_refused():
