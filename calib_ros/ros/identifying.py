@@ -94,6 +94,7 @@ class Snapshot(NamedTuple):
     numbers: dict[tuple[int, str, str], int]  # the operator's, by stamp, base and tool
     origin: dict[str, Any]
     configuration: str
+    cause: str  # what looks wrong in the messages and may explain a bad fit; empty if nothing
 
     def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
         """Return the operator's numbers of outlier samples."""
@@ -148,7 +149,8 @@ class Identifying:
         lost = tuple(too_much_lost(account, largest_loss)) if session.made else ()
         texts, owners = (session.warnings, str(account)), frames.owners
         loaded = Loaded(problem, asdict(account), *texts, refusals=lost, owners=owners)
-        known = numbers, origin, self._configuration()
+        cause = next((hint.text for hint in session.hints if hint.explains), '')
+        known = numbers, origin, self._configuration(), cause
         found = Snapshot(loaded, session.settings, samples, *known)
         self.progress.begin()
         return found
@@ -160,10 +162,10 @@ class Identifying:
         with self.progress.running():
             result = loaded.identified(settings.model, self.progress)
         steps = (step for reason in advice_of(result) for step in reason.steps)
-        first = next(steps, '')
+        telling = next((each.short for each in result.refusals if each.rule in TELLING_RULES), '')
+        first = next(steps, '') if telling else given.cause or next(steps, '')
         numbers = given.numbers_of(result.outliers)
         self.last = words.summary(result, numbers, loaded.warnings, first)
-        telling = next((each.short for each in result.refusals if each.rule in TELLING_RULES), '')
         hint = next(iter((*loaded.warnings, *words.other_remarks(result))), '')
         self._advice = telling or first or hint
         self.observability = words.observability_in_words(result)

@@ -10,7 +10,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
-from ros_cell import STOPS, Cell, pose_messages, topics
+from rclpy.serialization import serialize_message
+from ros_cell import STOPS, Cell, pose_messages, stamp_ns, topics
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
@@ -23,6 +25,10 @@ from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.report.advice import rules
 from calib_ros.ros.identifying import KEEP, NOT_FILED, Snapshot, _page, _without_middle
+from calib_ros.ros.inputs import deserialised
+from calib_ros.sampling.batches import Stream, feed
+from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.sources import STANDARD
 from calib_ros.settings import Settings
 
 
@@ -41,6 +47,20 @@ def test_errors_are_answers(cell, recording):
     )
     few = 'too few different poses: 2 measured, at least 5'
     assert few in cell.refused('identify').message
+
+
+def test_clocks_that_disagree_are_to_be_set_first(cell, recording):
+    """The answer said to check the chain, and the status to synchronise the clocks."""
+    session, (joints, poses) = cell.node.session, topics(recording).values()
+    come = sorted([*joints, *poses], key=stamp_ns)  # as they arrive, whatever their stamps
+    for message in poses:
+        message.header.stamp.sec += 3
+    pose, joint = Stream('poses', STANDARD[0].type, STANDARD[0]), Stream('joints', JOINT_STATE)
+    for first in range(0, len(come), 5):
+        some = [(joint if type(m) is JointState else pose, m) for m in come[first : first + 5]]
+        batch = [(stream, serialize_message(message)) for stream, message in some]
+        assert feed(session, batch, deserialised) == []
+    assert 'synchronise the clocks' in cell.refused('identify').message
 
 
 @pytest.mark.parametrize(
@@ -144,7 +164,9 @@ def test_the_page_that_is_saved_has_the_warnings():
     arm, rng = load_chain('ur10e'), np.random.default_rng(0)
     problem = Problem(arm, measure(arm, arm.random_joints(10, rng), rng, 5e-5, 2e-4))
     origin = {'journal': '', 'robot_serial': ''}
-    given = Snapshot(Loaded(problem, {}, ('the clock jumped',)), Settings(), (), {}, origin, '')
+    given = Snapshot(
+        Loaded(problem, {}, ('the clock jumped',)), Settings(), (), {}, origin, '', ''
+    )
     assert 'the clock jumped' in _page(given, identify(problem))
 
 
