@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import mmap
 import re
+import shlex
 import sqlite3
 import struct
 from collections import deque
@@ -71,7 +72,9 @@ def check_bag(path: Path) -> None:
     if metadata.exists():
         parse_yaml(read_text(metadata), str(metadata))
     elif not recorded_files(path):
-        raise ValueError('no .mcap or .db3 file is in it')
+        convert = f'rosbags-convert --src {shlex.quote(str(path))} --dst FOLDER'
+        older = f'; a bag of ROS 1 is converted by {convert}' if path.suffix == '.bag' else ''
+        raise ValueError(f'no .mcap or .db3 file is in it{older}')
     for file in recorded_files(path):
         if file.suffix == '.db3':
             with closing(_open(file)) as connection:

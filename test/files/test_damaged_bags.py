@@ -214,6 +214,8 @@ def test_what_is_no_bag_is_refused(tmp_path, file, content):
         session_of(path)
     assert str(path) in str(caught.value)
     assert 'copy it again from the computer' in str(caught.value)
+    convert = f'rosbags-convert --src {path} --dst FOLDER'
+    assert (convert in str(caught.value)) == (path.suffix == '.bag')
 
 
 def test_one_packed_message_that_is_damaged_costs_no_other(tmp_path):
