@@ -51,13 +51,16 @@ def of_them(count: int, what: str) -> str:
     return f'1 of them an {what}' if count == 1 else f'{count} of them {what}s'
 
 
-def rows_in_words(rows: Sequence[int], stamps_ns: NDArray[np.int64]) -> str:
+def rows_in_words(
+    rows: Sequence[int], stamps_ns: NDArray[np.int64], of_messages: bool = False
+) -> str:
     """Return measurements, by their numbers from 0, as text: line 2, or poses 3 to 5, 8.
 
-    The stamps (N,) of a table without any are its lines, in whole seconds.
+    The stamps (N,) of a table without any are its lines, in whole seconds; those of messages
+    may be such by chance.
     """
     lines, fractions = np.divmod(stamps_ns, 10**9)
-    by_line = bool(not fractions.any() and lines.min() > 0 and lines.max() < 10**6)
+    by_line = not (of_messages or fractions.any() or lines.min() <= 0 or lines.max() >= 10**6)
     numbers = np.take(lines, rows) if by_line else np.add(rows, 1)
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     words = [' to '.join(map(str, dict.fromkeys((run[0], run[-1])))) for run in runs]

@@ -126,7 +126,9 @@ def dead(chain: Chain, sets: Sets) -> Suspect | None:
     return None
 
 
-def repeating(chain: Chain, seen: Observations, largest: float) -> Suspect | None:
+def repeating(
+    chain: Chain, seen: Observations, largest: float, of_messages: bool
+) -> Suspect | None:
     """Return rows that repeat the measurement, or the joint values, of the row before them.
 
     They miss the chain, and the other ones moved meanwhile, by more than `largest` [m]; so do most
@@ -145,7 +147,7 @@ def repeating(chain: Chain, seen: Observations, largest: float) -> Suspect | Non
         again = (np.diff(values, axis=0) == 0.0).all(axis=1)
         rows = 1 + np.flatnonzero(again & moved & far[1:])
         if len(rows) >= max(LEAST_ASIDE, 0.5 * np.count_nonzero(again)):
-            names = rows_in_words(rows.tolist(), seen.stamps_ns)
+            names = rows_in_words(rows.tolist(), seen.stamps_ns, of_messages)
             return Suspect(
                 f'{what} repeated in {names} while the rest moved',
                 'leave these rows out, and look why its source stood still',

@@ -184,7 +184,7 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | 
     found = _named(problem, chain, given.sets, given, of_rows=True)
     if found is None or len(rows) == len(seen):
         return found
-    poses = rows_in_words(rows.tolist(), seen.stamps_ns)
+    poses = rows_in_words(rows.tolist(), seen.stamps_ns, problem.of_messages)
     among = f' of {len(seen)}' * poses.startswith('pose')
     alike = 'write them as the others ({} reads them)'
     named = (replace(each, remedy=alike.format(each.remedy)) for each in found.suspects)
@@ -276,7 +276,7 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> 
 
 
 def _of_repeats(problem: Problem, chain: Chain, seen: Observations) -> Explained | None:
-    odd = repeating(chain, seen, _largest(problem))
+    odd = repeating(chain, seen, _largest(problem), problem.of_messages)
     return None if odd is None else Explained((odd,), np.nan, np.nan)
 
 

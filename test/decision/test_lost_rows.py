@@ -99,8 +99,11 @@ def test_any_order_of_the_joints_is_named(name, oriented):
     assert found.suspects[0].what == f'the joint values are in the order {stand}'
 
 
-@pytest.mark.parametrize('part', ['measurement is', 'joint values are'])
-def test_a_source_that_repeats_its_last_value_is_named(part):
+@pytest.mark.parametrize(
+    ('part', 'rows_of'),
+    [('measurement is', 'lines'), ('joint values are', 'lines'), ('measurement is', 'poses')],
+)
+def test_a_source_that_repeats_its_last_value_is_named(part, rows_of):
     """If the other rows do not suffice; a fixed point touched again and again is measured so."""
     seen, rows = seen_of(40, True), slice(8, 30)
     held = {'joints': seen.joints.copy()}
@@ -108,9 +111,10 @@ def test_a_source_that_repeats_its_last_value_is_named(part):
         held = {'positions': seen.positions.copy(), 'rotations': seen.rotations.copy()}
     for values in held.values():
         values[rows] = values[7]
-    result = identify(Problem(UR10E, replace(seen, **held)))
+    of_messages = rows_of == 'poses'  # of a simulation, with stamps of whole seconds
+    result = identify(Problem(UR10E, replace(seen, **held), of_messages=of_messages))
     assert not result.accepted
-    assert f'the {part} repeated in lines 9 to 30 while the rest moved' in ' '.join(
+    assert f'the {part} repeated in {rows_of} 9 to 30 while the rest moved' in ' '.join(
         map(str, result.refusals)
     )
 
