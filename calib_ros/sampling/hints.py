@@ -136,7 +136,12 @@ def unseen(images: int, samples: Sequence[Sample], reason: str) -> list[Hint]:
     return [Hint('', words, explains=False)]
 
 
-def refocused(samples: Sequence[Sample]) -> list[Hint]:
+def spoilt(samples: Sequence[Sample]) -> list[Hint]:
+    """Report samples of a lens that changed, or of two places."""
+    return [*_refocused(samples), *_scattered(samples)]
+
+
+def _refocused(samples: Sequence[Sample]) -> list[Hint]:
     """Report a lens that changed between samples: no calibration may have several."""
     seen = {
         (each.view.lens, each.session, each.device, each.target, each.eye_in_hand): each
@@ -148,6 +153,27 @@ def refocused(samples: Sequence[Sample]) -> list[Hint]:
     except InputError as err:
         return [Hint(str(err), str(err), explains=False)]
     return []
+
+
+def _scattered(samples: Sequence[Sample]) -> list[Hint]:
+    """Report stops whose measurements scatter by more than any arm is off: of two places.
+
+    Noise of positions in mm is small beside these.
+    """
+    far = [
+        each.spread
+        for each in samples
+        if each.spread > Settings.largest_error
+        and each.position is not None
+        and each.spread > 1e-3 * np.abs(each.position).max()
+    ]
+    if len(far) < START or len(far) <= EXCEPTION * len(samples):
+        return []
+    words = f'measurements at {len(far)} stops scatter by {1e3 * np.median(far):.0f} mm'
+    words += ': do two devices or targets publish on a topic?'
+    return [
+        Hint(words, f'{words} Give each its own source, and measure again (node: ~/clear first)')
+    ]
 
 
 def losses(received: Mapping[str, int], dropped: Mapping[str, int]) -> list[Hint]:

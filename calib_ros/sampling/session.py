@@ -22,7 +22,7 @@ from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.dataset import Dataset, check_settings, collect, dataset_of
 from calib_ros.sampling.delay import Delay
-from calib_ros.sampling.hints import Hint, frozen, losses, progress, refocused, unheard, unseen
+from calib_ros.sampling.hints import Hint, frozen, losses, progress, spoilt, unheard, unseen
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.message_filter import FrameNames, JointNames, MessageFilter
 from calib_ros.sampling.messages import frame_name
@@ -246,7 +246,7 @@ class CalibrationSession:
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
         silent = self._names.silent_ones(self._collector.track.silent())
-        found += [*silent, *refocused(self.samples)]
+        found += [*silent, *spoilt(self.samples)]
         found += unseen(self.pictures.dropped.total(), self.samples, self.pictures.reason)
         found += self._pipeline.hints(self.received[POSES])
         if any(hint.explains for hint in found):

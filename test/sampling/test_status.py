@@ -28,6 +28,18 @@ def test_the_way_of_a_stop_can_be_changed_while_it_runs():
     assert made.account().unused['measurements: the stop was too short'] == 79
 
 
+@pytest.mark.parametrize(('spread', 'size', 'told'), [(0.02, 1, 1), (0.005, 1, 0), (0.05, 1e3, 0)])
+def test_measurements_of_two_places_are_told(spread, size, told):
+    """Two devices on one topic were averaged and accepted, half their distance away."""
+    given = [replace(s, spread=spread, position=size * s.position) for s in samples(30)]
+    made = session([*given[:4], *(replace(each, spread=0.0) for each in given[4:])])
+    assert 'two devices' not in made.status()  # of some an accident
+    made = session(given)
+    assert ('stops scatter by 20 mm: do two devices or targets' in made.status()) == told
+    assert made.doubtful or not told
+    assert len(made.warnings) == told
+
+
 def test_the_status_tells_how_far_it_is():
     made = session(samples(6))
     assert made.status().startswith('waiting for joint states; 6 poses, ')
