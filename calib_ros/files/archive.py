@@ -123,10 +123,10 @@ class Archive:
 
     def resume(self) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
         """Continue the newest journal, if any; return its samples, and warnings."""
-        found = self._files(_JOURNAL)
-        if not found:
+        newest = self.newest_journal()
+        if newest is None:
             return (), (f'nothing to resume in {self.folder}: a new session begins',)
-        self._path = found[-1]
+        self._path = newest
         try:
             samples, warnings = read_journal(self._path, self._joints)
         except InputError as err:
@@ -136,6 +136,10 @@ class Archive:
             ) from err
         self._journal = Journal(self._path, self._joints)
         return samples, warnings
+
+    def newest_journal(self) -> Path | None:
+        """Return the journal begun last."""
+        return next(reversed(self._files(_JOURNAL)), None)
 
     def newest_calibration(self) -> Path | None:
         """Return the calibration saved last."""

@@ -95,6 +95,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         """Samples not kept in data_dir at the end, and why; empty if all were."""
         if given.resume:
             self._resume()
+        elif earlier := self._archive.newest_journal():
+            words = f'a new session begins: to continue {earlier}, start with resume:=true'
+            self.get_logger().info(words)
         self._inputs = Inputs(self, self._streams())
         refuse_unknown_names(self, names)
         self.add_on_set_parameters_callback(self._check_parameters)

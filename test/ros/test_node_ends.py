@@ -107,6 +107,17 @@ def test_a_node_killed_in_its_first_run_goes_on_with_all_its_samples(
         np.testing.assert_array_equal(kept.position, sample.position)
 
 
+def test_a_session_that_could_go_on_is_told_of(journal):
+    """After a crash the node began another without a word."""
+    (path,) = journal.glob('*Z.csv')
+    with Cell() as cell:
+        told = cell.log()
+        node = cell.start(chain='ur10e', data_dir=str(journal))
+        said = f'to continue {path}, start with resume:=true'
+        cell.spin_until(lambda: any(said in each.msg for each in told))
+        assert node.session.samples == []
+
+
 SLOW_IDENTIFICATION = """
 import time
 from calib_ros.files import loading
