@@ -15,7 +15,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import contextmanager
 
 import numpy as np
 import rclpy
@@ -203,25 +202,19 @@ class Cell:
             stream = 'joints' if isinstance(messages[0], JointState) else 'measurements'
             queue += [(stamp_ns(m), stream, publisher, m) for m in messages]
         queue.sort(key=lambda item: item[0])
-        with self.without_reports():
-            for _, burst in itertools.groupby(queue, key=lambda item: item[0] // BURST_NS):
-                wanted = node.session.received.copy() if node else {}
-                for _, stream, publisher, message in burst:
-                    publisher.publish(message)
-                    if node:
-                        wanted[stream] += 1
-                self.spin_until(
-                    lambda end=wanted: all(node.session.received[k] >= n for k, n in end.items())
-                )
-
-    @contextmanager
-    def without_reports(self):
-        """Let the nodes report nothing meanwhile: it costs more than the messages."""
         period = round(1e9 * node_module.DIAGNOSTICS_PERIOD)
         reports = [t for node in self.nodes for t in node.timers if t.timer_period_ns == period]
-        for timer in reports:
+        for timer in reports:  # they cost more than the messages
             timer.cancel()
-        yield
+        for _, burst in itertools.groupby(queue, key=lambda item: item[0] // BURST_NS):
+            wanted = node.session.received.copy() if node else {}
+            for _, stream, publisher, message in burst:
+                publisher.publish(message)
+                if node:
+                    wanted[stream] += 1
+            self.spin_until(
+                lambda end=wanted: all(node.session.received[k] >= n for k, n in end.items())
+            )
         for timer in reports:
             timer.reset()
 

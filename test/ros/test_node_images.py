@@ -25,7 +25,7 @@ from calib_ros.apply.simulation import (
 )
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.files.bags import replay
-from calib_ros.files.cameras import cameras_of, grey, lens_in
+from calib_ros.files.cameras import cameras_of, lens_in
 from calib_ros.files.journal import read_journal
 from calib_ros.files.recording import Recording
 from calib_ros.files.tables import read_table
@@ -310,16 +310,6 @@ def test_images_that_come_while_others_are_looked_at_are_counted_and_hold_up_not
     assert 'images are not used, the last: it is blurred' in session.summary
 
 
-def test_memory_for_images_is_bounded(monkeypatch):
-    monkeypatch.setattr(pictures, 'MOST_BYTES', 1000)
-    kept = pictures.Pictures(lambda: 0.3)
-    for _ in range(50):
-        newest = kept.keep('image', 100, lambda: None)
-    assert newest in kept._kept
-    assert 4 < len(kept._kept) <= 10
-    assert np.diff(list(kept._kept)).max() < 40  # old ones are among them
-
-
 def test_memory_for_what_camera_infos_said_is_bounded(board):
     """Autofocus changes the lens with every image."""
     (camera,) = cameras_of(sources(board, Image)).values()
@@ -413,19 +403,3 @@ def test_what_images_need_is_told(monkeypatch, board):
     monkeypatch.setitem(sys.modules, 'cv2', None)
     with pytest.raises(ConfigError, match='boards need OpenCV: apt install'):
         cameras_of(sources(board, Image))
-
-
-def test_bayer_patterns_and_colours_become_grey():
-    rng = np.random.default_rng(0)
-    colours = rng.integers(0, 255, 3)
-    for encoding, places in (('bayer_rggb8', 'rggb'), ('bayer_gbrg8', 'gbrg')):
-        tile = np.array([colours['rgb'.index(each)] for each in places], np.uint8).reshape(2, 2)
-        image = np.tile(tile, (8, 8))
-        found = grey(image.ravel(), 16, 16, 16, encoding)[4:-4, 4:-4]
-        assert np.abs(found - colours @ (0.299, 0.587, 0.114)).max() < 2.0
-    for encoding in ('rgb8', 'bgr8', '8UC3', 'rgba8', 'bgra8'):
-        order = encoding.replace('8UC3', 'bgr').strip('8')
-        pixel = [0 if each == 'a' else colours['rgb'.index(each)] for each in order]
-        image = np.tile(np.array(pixel, np.uint8), (4, 6))
-        found = grey(image.ravel(), 4, 6, image.shape[1], encoding)
-        assert np.abs(found - colours @ (0.299, 0.587, 0.114)).max() < 2.0

@@ -1,0 +1,37 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Images of stops: how many are kept, and that their colours do not matter."""
+
+import numpy as np
+import pytest
+
+from calib_ros.files.cameras import grey
+from calib_ros.sampling import pictures
+
+pytest.importorskip('cv2')
+
+
+def test_memory_for_images_is_bounded(monkeypatch):
+    monkeypatch.setattr(pictures, 'MOST_BYTES', 1000)
+    kept = pictures.Pictures(lambda: 0.3)
+    for _ in range(50):
+        newest = kept.keep('image', 100, lambda: None)
+    assert newest in kept._kept
+    assert 4 < len(kept._kept) <= 10
+    assert np.diff(list(kept._kept)).max() < 40  # old ones are among them
+
+
+def test_bayer_patterns_and_colours_become_grey():
+    rng = np.random.default_rng(0)
+    colours = rng.integers(0, 255, 3)
+    for encoding, places in (('bayer_rggb8', 'rggb'), ('bayer_gbrg8', 'gbrg')):
+        tile = np.array([colours['rgb'.index(each)] for each in places], np.uint8).reshape(2, 2)
+        image = np.tile(tile, (8, 8))
+        found = grey(image.ravel(), 16, 16, 16, encoding)[4:-4, 4:-4]
+        assert np.abs(found - colours @ (0.299, 0.587, 0.114)).max() < 2.0
+    for encoding in ('rgb8', 'bgr8', '8UC3', 'rgba8', 'bgra8'):
+        order = encoding.replace('8UC3', 'bgr').strip('8')
+        pixel = [0 if each == 'a' else colours['rgb'.index(each)] for each in order]
+        image = np.tile(np.array(pixel, np.uint8), (4, 6))
+        found = grey(image.ravel(), 4, 6, image.shape[1], encoding)
+        assert np.abs(found - colours @ (0.299, 0.587, 0.114)).max() < 2.0
