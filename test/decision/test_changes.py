@@ -10,6 +10,7 @@ from fits import SCARA, UR10E
 
 from calib_ros.decision import changes
 from calib_ros.decision.changes import (
+    SCALE_OF_DEVICE,
     Effects,
     Explanation,
     Information,
@@ -184,3 +185,9 @@ def test_the_square_of_a_change_is_that_of_positions_in_the_best_frames():
     q = UR10E.random_joints(1000, np.random.default_rng(0))
     far = fit_to_arm(UR10E, frames, other, q)[1]
     assert np.sqrt(change @ square @ change) == pytest.approx(far, rel=0.1)
+
+
+def test_a_scale_is_told_in_ppm():
+    ppm = np.array([2.5e-4])
+    told = Explanation('device', (SCALE_OF_DEVICE,), 9.0, 0.0, 1.0, ppm, 0.1 * ppm)
+    assert told.in_words() == 'the scale of the device by +250 ± 49 ppm (95 %)'

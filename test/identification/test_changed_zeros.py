@@ -256,3 +256,24 @@ def test_new_frames_that_fit_their_poses_exactly_confirm_nothing(earlier, new):
         recalibrate(previous, problem(now, count, 1, oriented), 0.1, new=new)
     few = problem(now, 8, 1, oriented)
     assert 'elbow_joint' in owners(recalibrate(previous, few, 0.1, new=new).changed)[0]
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_heights_on_a_scara_are_told_from_each_other(seed):
+    """Corrected axes are not quite parallel, and the height of its target is that of its base."""
+    rng = np.random.default_rng(seed)
+    true = faulty(SCARA, Cell(angle_error=3e-4), rng)
+
+    def seen(now, count):
+        measured = measure(now, SCARA.random_joints(count, rng), rng, *NOISE)
+        return Problem(SCARA, measured, **SIGMAS)
+
+    previous = Calibration.of(identify(seen(true, 60)))
+    slipped = seen(true.with_offsets({'quill.d': 5e-4}), 8)
+    ((*reasons,),) = recalibrate(previous, slipped, 0.1).changed
+    assert 'quill.d' in {name for each in reasons for name in each.names}
+    elsewhere = {'tool': random_frame(rng, 0.2), 'base': random_frame(rng, 2.0)}
+    for new in (('tool',), ('tool', 'base')):
+        now = replace(true, **{name: elsewhere[name] for name in new})
+        found = recalibrate(previous, seen(now, 8), 0.1, new=new)
+        assert (found.accepted, found.changed) == (True, ())

@@ -38,7 +38,7 @@ def model(request, monkeypatch):
     seen = replace(seen, positions=seen.positions + 0.3 * shift)
     more = ()
     if request.param == 'sessions':
-        points = replace(seen.select(np.arange(20, 46)), base='base_B')
+        points = replace(seen.select(np.r_[:6, 26:46]), base='base_B')
         more = (replace(points, oriented=np.zeros(26, dtype=bool)),)
         seen = seen.select(np.arange(26))
     if request.param == 'thinned':
