@@ -5,6 +5,7 @@ and rows that are not like the others.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -154,3 +155,10 @@ def test_mistakes_of_many_rows_are_searched_in_some_of_them(monkeypatch):
     found = str(explained_alone(Problem(arm, seen), true))
     assert found.startswith(f'in lines {SOME_POSES + 1} to {len(q)} alone, the ')
     assert max(tried) <= SOME_POSES
+
+
+@pytest.mark.parametrize('change', [{}, {'socket': True}, {'pixels': 1}])
+def test_rows_are_not_told_apart_in_sockets_images_or_several_sets(change):
+    seen = SimpleNamespace(**{'socket': False, 'pixels': None} | change)
+    sets = (seen,) if change else (seen, seen)
+    assert mistakes._in_some_rows(SimpleNamespace(sets=sets), None, sets, None) is None

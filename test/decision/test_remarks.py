@@ -11,6 +11,7 @@ from fits import UR10E as UR
 
 from calib_ros.decision import plausibility
 from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.errors import InputError
 from calib_ros.estimation.levels import TELLING
 
 LENGTHS = [f'{j.name}.{kind}' for j in UR.joints for kind in 'ad' if getattr(j, kind)]
@@ -32,6 +33,7 @@ LENGTHS = [f'{j.name}.{kind}' for j in UR.joints for kind in 'ad' if getattr(j, 
             'grow alike',
         ),  # but a print is likelier
         (6e-3, {'beside': 2e-2}, ''),  # they do not grow alike
+        (6e-3, {'beside': 3e-4}, 'grow alike'),  # many hardly by chance
         (2e-3, {'by_scale': 0.15}, 'all lengths of the arm grow alike, by 0.2 %, as if'),
         (2e-3, {'by_scale': 0.14}, ''),
         (-2e-3, {'by_scale': 0.15, 'sigma_scale': 0.0}, 'shrink alike, by 0.2 %, as if'),
@@ -73,6 +75,87 @@ def test_a_joint_moves_one_way_in_a_session_that_is_long_enough(count, bend, tol
     found = plausibility._order(problem)
     assert ('an error of lift, moved' in found) == told
     assert bool(found) == told
+
+
+@dataclass(frozen=True)
+class Posed:
+    sets: tuple = ()
+    observations: object = None
+    more: object = ()
+    held_out: object = None
+    sigma_position: float = 1e-4
+    sigma_orientation: float = 3e-4
+    largest_error: float = 0.02
+    largest_angle: float = 0.05
+
+
+@pytest.mark.parametrize(
+    ('change', 'told'),
+    [
+        ({}, '20.0 times'),
+        ({'frames': ('base', 'tool', 'base_B', 'tool')}, ''),  # one target: one session
+        ({'alone': (0.1, 3.1)}, ''),
+        ({'alone': (0.1, InputError('too few'))}, ''),
+        ({'consistent': True}, ''),
+        ({'rules': (Rule.ENCODER,)}, ''),
+        ({'rules': (Rule.MOVED,)}, ''),
+        ({'rules': (Rule.GAIN,)}, '20.0 times'),
+    ],
+)
+def test_two_sessions_are_of_one_arm_unless_each_fits_far_better_alone(change, told, monkeypatch):
+    base, tool, *others = change.get('frames', ('base', 'tool', 'base_B', 'tool_B'))
+    first = SimpleNamespace(base=base, tool=tool, k=0)
+    second = SimpleNamespace(base=others[0], tool=others[1], k=1)
+    alone = change.get('alone', (0.2, 0.5))
+
+    def fit(problem):
+        size = alone[problem.observations.k]
+        if isinstance(size, Exception):
+            raise size
+        assert (*problem.more, *problem.held_out) == ()
+        return None, None, SimpleNamespace(noise=SimpleNamespace(position=size))
+
+    monkeypatch.setattr(plausibility, 'fit', fit)
+    monkeypatch.setattr(plausibility, '_some', lambda each: each)
+    noise = SimpleNamespace(consistent=change.get('consistent', False), position=10.0)
+    refusals = [SimpleNamespace(rule=rule) for rule in change.get('rules', ())]
+    result = SimpleNamespace(noise=noise, refusals=refusals)
+    found = plausibility._sessions(Posed((first, second)), result)
+    assert told in found
+    assert bool(found) == bool(told)
+
+
+@pytest.mark.parametrize(
+    'change', [{'velocity': 1}, {'pixels': 1}, {'rule': Rule.ENCODER}, {'position': 1.0}]
+)
+def test_no_lag_is_sought_in_motion_images_or_what_is_explained(change):
+    seen = SimpleNamespace(velocity=change.get('velocity'), pixels=change.get('pixels'))
+    noise = SimpleNamespace(position=change.get('position', 3.0))
+    refusals = [SimpleNamespace(rule=change.get('rule', Rule.GAIN))]
+    result = SimpleNamespace(refusals=refusals, noise=noise)
+    assert plausibility._lag(Posed((seen,)), result) is result
+
+
+@pytest.mark.parametrize(
+    ('position', 'orientation', 'told'),
+    [
+        (0.5, 4.9, ''),
+        (0.5, 5.1, 'set sigma_orientation to 0.0015'),
+        (1.5, 7.0, ''),
+        (1.5, 8.0, 'set sigma_orientation to 0.0024'),
+        (1.5, 200.0, ''),  # no device is so bad
+    ],
+)
+def test_orientations_outweigh_positions_that_are_as_stated(position, orientation, told):
+    sigmas = np.repeat([1e-4, 3e-4], 3)
+    few = SimpleNamespace(covariances=lambda _: np.tile(np.diag(sigmas**2), (4, 1, 1)))
+    seen = SimpleNamespace(pixels=None, spread=lambda: few)
+    noise = SimpleNamespace(consistent=False, position=position, orientation=orientation)
+    problem = Posed((seen,))
+    result = SimpleNamespace(noise=noise, validation=None)
+    found = plausibility._sigmas(problem, result)
+    assert told in found
+    assert bool(found) == bool(told)
 
 
 @dataclass(frozen=True)

@@ -186,6 +186,28 @@ def test_ways_to_write_a_pose_are_undone_in_the_poses_as_they_were_measured(
             np.testing.assert_allclose(getattr(undone, name), getattr(given, name), atol=1e-9)
 
 
+@pytest.mark.parametrize('inverse', [False, True])
+@pytest.mark.parametrize(
+    ('what', 'matrix'),
+    [
+        ('the x coordinates alone are in mm, not metres', np.diag([1e3, 1.0, 1.0])),
+        ('the positions are in mm, not metres', 1e3 * np.eye(3)),
+        ('the coordinates x, y, z of the positions are y, z, x', np.eye(3)[[2, 0, 1]]),
+        ('the coordinates x, y, z of the positions are -x, y, z', np.diag([-1.0, 1.0, 1.0])),
+    ],
+)
+def test_what_is_wrong_with_coordinates_is_undone_as_they_were_measured(
+    what, matrix, inverse, rng
+):
+    arm = load_chain('ur10e')
+    seen = measure(arm, arm.random_joints(9, rng), rng)
+    spoilt = replace(seen, positions=seen.positions @ matrix.T)
+    spoilt, given = (each.inverted() if inverse else each for each in (spoilt, seen))
+    (found,) = (each for each in suspects(arm, (spoilt,)) if each.what == what)
+    (undone,) = found.undone((spoilt,))
+    np.testing.assert_allclose(undone.positions, given.positions, atol=1e-9)
+
+
 @pytest.mark.parametrize(('size', 'times'), [(0.5, '2'), (1.25, '0.8'), (0.3, '3.33')])
 def test_the_size_of_a_board_is_told_as_it_is_stated(size, times, rng):
     arm = load_chain('ur10e')
