@@ -258,7 +258,7 @@ class _Scan:
             equations, freedom, left = self._budget(group)
             if left <= STEP_TOLERANCE**2 * equations or freedom <= rank.max() + 1.0:
                 continue
-            gain = (along**2).sum(axis=1) * ((places > 0) | group.held)
+            gain = (along**2).sum(axis=1)
             share = np.minimum(gain / left, 1.0 - 1e-12)
             k = int(np.argmax(share))
             rest = (1.0 - share[k]) / (freedom - rank[k])

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision import lost_rows
 from calib_ros.decision.lost_rows import _apart, _where, row_loss
 from calib_ros.decision.misfits import zero_of_distances
 from calib_ros.decision.mistakes import explained
@@ -42,6 +43,27 @@ def test_rows_lost_in_one_of_two_tables_are_named(positions, joints, said, orien
     result = identify(Problem(UR10E, replace(measured, joints=kept)))
     assert not result.accepted
     assert result.refusals[0].startswith(f'{said} their measurement')
+
+
+@pytest.mark.parametrize(('row', 'told'), [(20, True), (30, False)])
+def test_the_error_once_corrected_tells_nothing_where_most_rows_are_right(row, told):
+    seen = seen_of(40, False)
+    kept = replace(seen.select(np.delete(np.arange(40), [row, 39])), joints=seen.joints[:-2])
+    found = explained(Problem(UR10E, kept))
+    assert f'from line {row + 2} on' in found.suspects[0].what
+    assert (found.corrected < 1e-2) == told
+
+
+@pytest.mark.parametrize(
+    ('fewest', 'most', 'told'), [(38, 38, True), (39, 99, False), (1, 37, False)]
+)
+def test_a_loss_is_sought_in_tables_of_so_many_rows(fewest, most, told, monkeypatch):
+    monkeypatch.setattr(lost_rows, 'FEWEST_ROWS', fewest)
+    monkeypatch.setattr(lost_rows, 'MOST_SEARCHED', most)
+    seen = seen_of(40, False)
+    kept = replace(seen.select(np.delete(np.arange(40), [20, 39])), joints=seen.joints[:-2])
+    found = row_loss(Problem(UR10E, kept), UR10E, kept, 5e-3)
+    assert (found is not None) == told
 
 
 def test_rows_lost_before_the_first_and_again_later_are_not_told_as_one():

@@ -13,6 +13,8 @@ from calib_ros.decision import plausibility
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import TELLING
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.lens import Lens
 
 LENGTHS = [f'{j.name}.{kind}' for j in UR.joints for kind in 'ad' if getattr(j, kind)]
 
@@ -80,6 +82,8 @@ def test_a_joint_moves_one_way_in_a_session_that_is_long_enough(count, bend, tol
 @dataclass(frozen=True)
 class Posed:
     sets: tuple = ()
+    chain: object = UR
+    of_messages: bool = False
     observations: object = None
     more: object = ()
     held_out: object = None
@@ -156,6 +160,39 @@ def test_orientations_outweigh_positions_that_are_as_stated(position, orientatio
     found = plausibility._sigmas(problem, result)
     assert told in found
     assert bool(found) == bool(told)
+
+
+@pytest.mark.parametrize(
+    ('share', 'change', 'told'),
+    [
+        (0.6, {}, 'other intrinsics of the camera than those given explain 56 %'),
+        (1.0, {}, 'explain 100 % of the residuals: --lens fitted'),
+        (0.5, {}, ''),
+        (0.5, {'imitates': True}, 'explain 45 %'),
+        (0.1, {'imitates': True}, ''),  # by chance
+        (0.6, {'converged': False}, ''),
+        (0.6, {'step': SimpleNamespace(harmful=True)}, ''),
+        (0.6, {'step': SimpleNamespace(harmful=False)}, 'other intrinsics'),
+        (1.0, {'fixed': False}, ''),
+        (1.0, {'count': 6}, ''),  # as many freedoms as intrinsics and parameters
+        (1.0, {'count': 7}, 'explain 100 %'),
+    ],
+)
+def test_a_lens_explains_what_is_left_by_the_freedoms_of_the_images(
+    share, change, told, monkeypatch
+):
+    given = {'imitates': False, 'converged': True, 'step': None, 'count': 20} | change
+    monkeypatch.setattr(plausibility, 'explained_share', lambda *_: share)
+    monkeypatch.setattr(plausibility, '_imitated', lambda *_: given['imitates'])
+    lens = Lens(800.0, 800.0, 320.0, 240.0, fixed=given.get('fixed', True))
+    chain = UR.with_frame('camera', Frame(lens=lens))
+    seen = SimpleNamespace(pixels=1, camera='camera', images=np.arange(given['count']))
+    result = SimpleNamespace(**given, names=range(27), chain=chain)
+    sets = seen, SimpleNamespace(pixels=None)
+    found, imitates = plausibility._lens(Posed(sets, chain), result)
+    assert told in found
+    assert bool(found) == bool(told)
+    assert imitates == (bool(told) and given['imitates'])
 
 
 @dataclass(frozen=True)

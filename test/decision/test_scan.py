@@ -42,6 +42,13 @@ def test_the_coarse_search_is_a_tenth_of_the_shorter_side_apart(count):
     assert not len(steps._some_places(2 * LEAST_ASIDE - 1))
 
 
+def test_a_step_between_places_of_the_coarse_search_may_explain_just_enough(monkeypatch):
+    fitted = bumped()
+    monkeypatch.setattr(steps, '_some_places', lambda _: np.array([AT - 4, AT + 4]))
+    monkeypatch.setattr(steps, 'EXPLAINED', find_step(fitted).share - 1e-6)
+    assert find_step(fitted).sample == AT
+
+
 @pytest.mark.parametrize(('share', 'found'), [(0.3, False), (30.0, True)])
 def test_residuals_below_the_tolerance_of_the_fit_show_no_step(share, found):
     step = find_step(bumped(size=share * STEP_TOLERANCE * NOISE[0], noise=(0.0, 0.0)))
