@@ -16,6 +16,7 @@ from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import owners, stacked
 from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.problem import Problem
+from calib_ros.identification import identification
 from calib_ros.identification.identification import identify, identify_model
 
 pytestmark = pytest.mark.usefixtures('unsearched')
@@ -146,6 +147,16 @@ def test_what_rounding_gives_to_the_zero_of_a_joint(step, rng):
             'elbow_joint.theta': one * np.sqrt(0.5**2 + 2 * 0.25**2),
         }
     )
+
+
+def test_errors_that_rounding_gives_to_zeros_are_of_the_session(rng, monkeypatch):
+    q, found = UR10E.random_joints(40, rng).round(2), []
+    problem = Problem(UR10E, measure(arm(rng), q, rng, *NOISE), **SIGMAS)
+    for size in (0.0, 1e-3):
+        errors = {'elbow_joint.theta': size}
+        monkeypatch.setattr(identification, 'rounding_errors', lambda *_, e=errors: e)
+        found.append(np.linalg.norm(identify(problem).region.device))
+    assert found[1] > found[0] + 5e-4
 
 
 def test_whether_rounding_explains_the_gain_is_an_f_test(rng, monkeypatch):
