@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Effects of changes and their evidence. `test_recalibration.py` has the changes themselves."""
 
+from collections import Counter
 from types import SimpleNamespace
 
 import numpy as np
@@ -167,6 +168,19 @@ def test_the_chance_of_an_explanation_is_that_of_all_that_are_tried(size, rng):
     assert best.chance == min(1.0, len(columns.sets) * chance_of(gain, rank, 50.0))
     assert (best.gain, best.change.tolist()) == (gain, change.tolist())
     assert best.sigma.tolist() == np.sqrt(np.diag(covariance)).tolist()
+
+
+def test_what_is_outside_the_arm_is_tried_as_often_as_the_joint_that_is_tried_most(rng):
+    names = [*THREE, Parameter('elbow_joint.a'), Parameter('wrist_1_joint.d')]
+    information, columns = known(rng, np.zeros(5), names=names), Effects(UR10E, names, scaled=True)
+    tried = Counter(owner for owner, _ in columns.sets)
+    tried['device'] = max(tried.values())
+    odds = [columns.evidence(information, each)[0] for _, each in columns.sets]
+    odds = np.exp(odds) / [tried[owner] for owner, _ in columns.sets]
+    found = reasons_of(information, columns, 50.0, most=1.0)
+    wanted = np.sort(odds / odds.sum())[::-1][: len(found)]
+    assert [each.share for each in found] == pytest.approx(wanted.tolist())
+    assert 'device' in {each.owner for each in found}
 
 
 def test_the_zeros_of_all_joints_are_one_change(rng):

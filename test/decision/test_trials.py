@@ -51,5 +51,7 @@ def test_gross_errors_do_not_spoil_the_refinement():
     off = near.with_offsets({f'base.{axis}': 1e-3 for axis in 'xyz'})
     rough = Trial(off, (seen,), (arm,))
     assert rough.error == pytest.approx(1e-3 * np.sqrt(3.0))
-    found = refined(Problem(UR10E, seen, sigma_position=NOISE[0]), rough)
-    assert misses(found.chain, seen, arm)[8:].max() < 1e-6
+    turned = Trial(near.with_offsets({'base.rz': 1e-3}), (seen,), (arm,))
+    for trial in (rough, turned):
+        found = refined(Problem(UR10E, seen, sigma_position=NOISE[0]), trial)
+        assert misses(found.chain, seen, arm)[8:].max() < 1e-6
