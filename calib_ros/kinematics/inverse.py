@@ -151,4 +151,4 @@ def a_turn_away(joint: Joint, value: float) -> str:
     turns = np.round((value - np.mean(joint.range)) / (2.0 * np.pi))
     within = value - 2.0 * np.pi * turns
     inside = joint.range[0] <= within <= joint.range[1]
-    return f'; a full turn away, {within:.6g} is within them: give that' * bool(turns and inside)
+    return f'; a full turn away, {within:.6g} is within them: give that' * bool(inside)

@@ -16,7 +16,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration, load_calibration, parse_calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.records import nominal_document
-from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.settings import Settings
@@ -67,6 +67,12 @@ def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nomi
                 getattr(theirs, ask)(q), getattr(ours, ask)(q), rtol=1e-6, atol=1e-12
             )
     np.testing.assert_array_equal(read.region.covers(q), found.region.covers(q))
+    wavy = replace(found, unmodelled=found.unmodelled._replace(waves=1e-4))
+    sigma, known = wavy.sigma(q), found.region.known(q)
+    assert (sigma > known).all()
+    np.testing.assert_array_equal(replace(wavy, residual=None).remaining(q), sigma)
+    wanted = np.maximum(sigma, np.hypot(known, found.residual))  # that has the waves
+    np.testing.assert_allclose(wavy.remaining(q), wanted)
     jacobian = ErrorModel(found.chain, found.names).jacobian(q)
     variances = np.einsum('ncp,pr,ncr->nc', jacobian, found.covariance, jacobian)
     bare = replace(read, region=None)
@@ -132,6 +138,9 @@ def test_of_a_file_of_before_what_it_tells_is_known(found):
     np.testing.assert_allclose(read.remaining(q), found.remaining(q), rtol=1e-6)
     first, second = (np.sqrt(np.mean(each.removed(q)[0] ** 2)) for each in (read, found))
     assert first == pytest.approx(second, rel=0.05)
+    held = {name: Frame(fixed=True) for name in ('base', 'tool')}
+    both = parse_calibration(dump_chain(replace(UR, **held), {'nominal': record['nominal']}), 'c')
+    assert both.before.base == both.chain.base
 
 
 def test_a_file_that_was_cut_off_is_refused(found):

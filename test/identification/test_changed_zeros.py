@@ -14,6 +14,7 @@ from calib_ros.decision.changes import reason_in_words
 from calib_ros.errors import InputError
 from calib_ros.identification.recalibrated import ANEW
 from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.parameter import Parameter
 
 ALL = np.radians([0.1, -0.15, 0.08, 0.2, -0.12, 0.05])
 
@@ -106,6 +107,7 @@ def test_a_frame_far_from_where_it_was_is_the_only_change(earlier, frame):
     assert found.accepted
     (reasons,) = found.changed
     assert reasons[0].owner == frame
+    assert {Parameter(name).owner for name in reasons[0].names} == {frame}
     assert found.calibration.record['changed'] == [reason_in_words(reasons)]
     moved = true.frame(frame).matrix[:3, 3] - now.frame(frame).matrix[:3, 3]
     assert found.before.rms_mm > 100.0 * np.linalg.norm(moved)

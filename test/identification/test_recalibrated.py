@@ -1,0 +1,75 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""By which figures a recalibration is accepted, part by part."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fits import UR10E, problem
+
+from calib_ros import Calibration, identify, recalibrate
+from calib_ros.decision.changes import FALSE, LOAD, SCALE_OF_DEVICE
+from calib_ros.identification.recalibrated import Recalibration
+from calib_ros.settings import Settings
+
+LIMIT = 1e3 * Settings.largest_error
+
+
+def result(before=0.1, after=0.1, owners=(), **change):
+    """Return a recalibration with errors [mm] before and after."""
+    figures = tuple(SimpleNamespace(rms_mm=each) for each in (before, after))
+    known = {'known_before': 1e-4, 'known_after': 1e-4, 'moved': 1e-4, 'fitted_mm': 0.1}
+    return Recalibration(
+        **{'unexplained': 0.5, 'calibration': SimpleNamespace(residual=1e-4)} | known | change,
+        changed=tuple((SimpleNamespace(owner=each),) for each in owners),
+        comparison=SimpleNamespace(figures=figures),
+    )
+
+
+@pytest.mark.parametrize(
+    ('change', 'accepted'),
+    [
+        ({}, True),
+        ({'after': 0.149}, True),
+        ({'after': 0.151}, False),  # more than chance
+        ({'before': 0.0, 'after': 0.0}, True),  # simulated without noise
+        ({'before': 0.0, 'after': 1e-7}, True),
+        ({'before': 0.4, 'after': 0.49}, True),
+        ({'before': 0.4, 'after': 0.51}, False),  # five times what is usual
+        ({'before': LIMIT, 'after': 1.01 * LIMIT, 'fitted_mm': LIMIT}, False),
+        ({'unexplained': FALSE}, False),
+        ({'reused': 0.1}, False),
+        ({'owners': ['elbow_joint'], 'before': 0.2}, True),
+        ({'owners': ['elbow_joint']}, False),  # which changed nothing
+        ({'owners': [LOAD], 'before': 0.2}, False),
+        ({'owners': ['elbow_joint', SCALE_OF_DEVICE.owner], 'before': 0.2}, False),
+        ({'known_after': 1.49e-4}, True),
+        ({'known_after': 1.51e-4}, False),
+        ({'known_after': 1.51e-4, 'moved': 1e-3}, True),
+    ],
+)
+def test_new_poses_agree_by_themselves_and_tell_enough(change, accepted):
+    assert result(**change).accepted == accepted
+
+
+@pytest.mark.parametrize(
+    ('change', 'perhaps'),
+    [
+        ({'unexplained': FALSE}, True),
+        ({'owners': ['elbow_joint', 'base']}, True),
+        ({'owners': ['elbow_joint']}, False),
+        ({'unexplained': FALSE, 'reused': 0.1}, False),
+        ({'unexplained': FALSE, 'before': 0.99 * LIMIT}, False),
+    ],
+)
+def test_a_frame_may_have_moved_far_where_errors_are_large(change, perhaps):
+    assert result(**{'before': 1.01 * LIMIT} | change).perhaps_moved == perhaps
+
+
+def test_an_arm_is_known_less_the_longer_it_was_not_measured():
+    previous = Calibration.of(identify(problem(UR10E, 40, 0)))
+    years = [-1.0, 0.0, 1.0, 10.0]
+    known = [recalibrate(previous, problem(UR10E, 8, 1), each).known_before for each in years]
+    assert known[0] == known[1]
+    assert (np.diff(known[1:]) > 0.0).all()
