@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib_ros.apply.simulation import Cell, drive
+from calib_ros.apply.simulation import Camera, Cell, _facing, before_camera, drive, photograph
 from calib_ros.kinematics.chain_file import load_chain
 
 
@@ -16,3 +16,14 @@ def test_an_arm_is_driven_smoothly_from_stop_to_stop(rng):
     speeds = np.diff(joints, axis=0) / (1e-9 * np.diff(stamps)[:, np.newaxis])
     fastest = np.abs(np.diff(stops, axis=0)).max() / cell.move * 15.0 / 8.0
     assert np.abs(speeds).max() == pytest.approx(fastest, rel=0.01)
+
+
+def test_boards_stand_in_the_view_of_a_camera_as_far_away_as_said(rng):
+    points = np.array([[x, y, 0.0] for x in (0.0, 0.3) for y in (0.0, 0.4)])
+    camera = Camera()
+    far = (_facing(camera, points, 500, rng)[:, :3] @ [*points.mean(axis=0), 1.0])[:, 2]
+    assert far / camera.depth == pytest.approx(np.clip(far / camera.depth, 0.7, 1.3))
+    assert np.ptp(far) == pytest.approx(0.6 * camera.depth, rel=0.03)
+    chain = before_camera(load_chain('ur10e'), camera, points, True, rng)
+    pixels = photograph(chain, camera, points, True, 10, rng).pixels
+    assert ((pixels > 0.0) & (pixels < (camera.width, camera.height))).all()

@@ -152,6 +152,7 @@ def test_the_limits_hold_as_often_as_they_say(shape, count):
     held = np.array([lower <= truth, truth <= upper])
     assert (held.mean(axis=1) > stats.binom.ppf(1e-3, 2000, 0.97) / 2000).all()
     assert held.mean() < 0.999  # wide enough, and no wider
+    assert rms_interval(0.0 * errors[0], np.arange(count)) == (0.0, 0.0)
 
 
 def test_the_limits_of_a_verdict_are_those(arm, monkeypatch):

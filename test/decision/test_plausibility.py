@@ -107,6 +107,9 @@ def test_the_share_explained_is_that_of_least_squares():
     found = explained_share(problem, chain, names, added)
     assert found == pytest.approx(1.0 - more / fewer, rel=1e-6)
     assert 0.1 < found < 0.9
+    for count, some in ((3, False), (4, True)):  # of 18 rows 3 would be left, of 24 rows 9
+        few = replace(problem, observations=problem.observations.select(np.arange(count)))
+        assert (explained_share(few, chain, names, added) > 0.0) == some
 
 
 @pytest.mark.parametrize('sigma', [0.05, 5e-3])

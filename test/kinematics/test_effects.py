@@ -245,6 +245,13 @@ def test_unknown_effects_are_named_with_the_alternatives(name, alternative):
     assert alternative in str(caught.value).partition('valid:')[2]
 
 
+@pytest.mark.parametrize('model', ['geometric', 'auto'])
+def test_no_effects_join_a_model_that_stands_alone(model):
+    with pytest.raises(ConfigError, match=f'model {model} stands alone') as caught:
+        effects.resolve(UR10E, model)
+    assert not isinstance(caught.value, UnknownNameError)
+
+
 def rich(rng):
     """Return a chain with everything that a chain file can hold."""
     chain = faulty(loaded(UR10E, rng), Cell(), rng)
