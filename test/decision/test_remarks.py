@@ -34,7 +34,8 @@ LENGTHS = [f'{j.name}.{kind}' for j in UR.joints for kind in 'ad' if getattr(j, 
             {'names': LENGTHS[:2], 'beside': 2e-4, 'pixels': 1},
             'grow alike',
         ),  # but a print is likelier
-        (6e-3, {'beside': 2e-2}, ''),  # they do not grow alike
+        (6e-3, {'beside': -3e-3}, ''),  # they do not grow alike
+        (6e-3, {'beside': -3e-3, 'pixels': 1}, ''),
         (6e-3, {'beside': 3e-4}, 'grow alike'),  # many hardly by chance
         (2e-3, {'by_scale': 0.15}, 'all lengths of the arm grow alike, by 0.2 %, as if'),
         (2e-3, {'by_scale': 0.14}, ''),

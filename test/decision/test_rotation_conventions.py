@@ -5,7 +5,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib_ros.decision.rotation_conventions import _angles, _beyond, _vectors
+from calib_ros.decision.rotation_conventions import _angles, _beyond, _vectors, misread
 
 
 def test_angles_are_beyond_the_usual_range_by_the_one_that_is_furthest():
@@ -27,3 +27,13 @@ def test_both_triples_and_both_vectors_are_the_same_rotation():
     for vectors in _vectors(turns.as_matrix()):
         again = Rotation.from_rotvec(vectors)
         np.testing.assert_allclose(again.as_matrix(), turns.as_matrix(), atol=1e-9)
+
+
+def test_euler_angles_read_as_vectors_may_be_of_more_than_half_a_turn(rng):
+    angles = rng.uniform(-np.pi, np.pi, (200, 3)) * [1.0, 0.5, 1.0]
+    meant = Rotation.from_euler('XYZ', angles).as_matrix()
+    read = Rotation.from_rotvec(angles).as_matrix()
+    far = np.linalg.norm(angles, axis=1) > np.pi
+    found = (turn for what, _, turn in misread() if 'are Euler angles XYZ' in what)
+    for turn, wanted in zip(found, (~far, far), strict=True):
+        np.testing.assert_allclose(turn(read)[wanted], meant[wanted], atol=1e-9)

@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 from functools import reduce
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
@@ -41,6 +41,10 @@ RANKS = {
     'the lengths of the chain file are in mm, not metres': (1, ''),
     'the DH table is in the modified convention, not the standard one': (3, ''),
     'the chain file gives a wrong base (fixed: true)': (3, ''),
+    'the chain file gives a wrong tool (fixed: true)': (3, ''),
+    'the chain file gives a wrong base and tool (fixed: true)': (3, ''),
+    'the coordinates x, y, z of the positions are -x, y, z': (1, 'measured'),
+    'the coordinates x, y, z of the positions are y, z, x': (2, 'measured'),
     'the joint values stand 2 rows above their measurement': (2, ''),
 }
 
@@ -62,6 +66,9 @@ def test_signs_hide_each_other_in_twos_and_threes_and_behind_another_hand(rng):
     arm = load_chain('ur10e')
     seen = measure(arm, arm.random_joints(5, rng), rng)
     options = [*suspects(arm, (seen,))]
+    coupled = {each.what for each in options if each.what.endswith(': they are coupled')}
+    pairs = pairwise(arm.joint_names)
+    assert coupled == {f'{k} is not given against {j}: they are coupled' for j, k in pairs}
     found = hidden(arm, options)
     others = [each for each in options if each.part in ('handed', 'order')]
     assert len(found) == 15 + 6 * len(others) + 20

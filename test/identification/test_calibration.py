@@ -22,6 +22,7 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.settings import Settings
 
 UR = load_chain('ur10e')
+OWNED = {'session': '', 'eye_in_hand': False, 'socket': False, 'label': ''}
 
 
 @pytest.fixture(scope='module')
@@ -111,6 +112,9 @@ def test_the_nominal_chain_of_axes_that_coincide_has_no_b():
         ('noise_in_sigma', {'shared': None}),
         ('noise_in_sigma', {'given': {'sigma_position': 'small'}}),
         ('frames', {'base': {'session': ''}}),
+        ('frames', {'base': OWNED | {'label': 3}}),
+        ('frames', {'base': OWNED | {'eye_in_hand': 0}}),
+        ('frames', {'base': OWNED | {'socket': 0}}),
         ('frames', {'base': 3}),
         ('nominal', {'base': {'xyz': [0.0]}}),
         ('nominal', {'effects': {'elbow_joint.sin_1': 'a'}}),

@@ -54,6 +54,7 @@ def test_an_arm_that_has_not_changed_is_the_same_wherever_the_device_stands(nigh
         assert found.same
         assert not found.changed
         assert found.chance > 0.01
+        assert 0.5 < np.sqrt(np.mean((found.change / found.sigma) ** 2)) < 1.5
         assert found.limit < 1e-4
         assert found.left < 1e-7
         assert found.in_words().startswith('unchanged within 0.0')
@@ -89,13 +90,16 @@ def test_a_device_that_bends_space_elsewhere_is_no_change_of_the_arm(name, seed)
 def test_a_joint_that_was_bumped_is_named(nights):
     true, first = nights
     bumped = elsewhere(true).with_offsets({'elbow_joint.theta': 3e-4})
-    found = difference(first, calibrated(bumped, 1))
+    second = calibrated(bumped, 1)
+    found = difference(first, second)
     assert not found.same
     ((reason, *others),) = found.changed
     assert reason.owner == 'elbow_joint'
     assert not others
     assert reason.change[0] == pytest.approx(3e-4, abs=4.0 * reason.sigma[0])
     assert found.unexplained > 0.01
+    few = replace(first, freedom=5.0)  # of either night
+    assert difference(few, second).chance == difference(first, replace(second, freedom=5.0)).chance
     words = found.in_words()
     assert 'elbow_joint.theta by +0.' in words
     assert 'nothing else: was it bumped?' in words
