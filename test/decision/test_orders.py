@@ -18,6 +18,7 @@ from calib_ros.decision.mistakes import explained, explained_alone
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.settings import LEVER
 
 
 @pytest.mark.parametrize('oriented', [True, False])
@@ -162,3 +163,14 @@ def test_rows_are_not_told_apart_in_sockets_images_or_several_sets(change):
     seen = SimpleNamespace(**{'socket': False, 'pixels': None} | change)
     sets = (seen,) if change else (seen, seen)
     assert mistakes._in_some_rows(SimpleNamespace(sets=sets), None, sets, None) is None
+
+
+@pytest.mark.parametrize('share', [0.99, 1.01])
+def test_an_arm_is_far_off_by_its_largest_errors_of_position_and_angle(share):
+    """A third of the angle counts, by the lever."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(1)
+    seen = measure(faulty(arm, Cell(), rng), arm.random_joints(20, rng), rng, *NOISE)
+    problem = Problem(arm, replace(seen, joints=seen.joints * [1, 1, -1, 1, 1, 1]))
+    half = 0.5 * share * trials.in_frames(problem, arm, problem.sets).error
+    limits = {'largest_error': half, 'largest_angle': 3.0 * half / LEVER}
+    assert (explained(replace(problem, **limits), far=True) is None) == (share > 1.0)

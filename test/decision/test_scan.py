@@ -49,6 +49,18 @@ def test_a_step_between_places_of_the_coarse_search_may_explain_just_enough(monk
     assert find_step(fitted).sample == AT
 
 
+def test_a_held_frame_that_does_not_explain_most_is_not_named(monkeypatch, rng):
+    true = arm(rng)
+    seen = measure(true, UR10E.random_joints(COUNT, rng), rng, *NOISE)
+    matrix = true.base.matrix + 3e-3 * np.eye(4, k=3)
+    chain = replace(UR10E, base=replace(true.base, matrix=matrix, fixed=True))
+    fitted = fitting.fit(Problem(chain, seen, **SIGMAS))[2]
+    found = find_step(fitted)
+    assert found.held
+    monkeypatch.setattr(steps, 'EXPLAINED', found.share + 1e-6)
+    assert find_step(fitted) is None
+
+
 @pytest.mark.parametrize(('share', 'found'), [(0.3, False), (30.0, True)])
 def test_residuals_below_the_tolerance_of_the_fit_show_no_step(share, found):
     step = find_step(bumped(size=share * STEP_TOLERANCE * NOISE[0], noise=(0.0, 0.0)))
