@@ -83,17 +83,6 @@ def test_two_robots_in_two_sessions_are_not_averaged(seed, alike):
     assert said == ([] if alike else [Rule.MISTAKE])
 
 
-def test_a_session_that_cannot_be_fitted_alone_is_of_the_same_arm():
-    """Only the first has the signs of the last moves, which backlash needs."""
-    first, second = (seen_of(arm(0), seed, 40) for seed in (1, 2))
-    signs = np.sign(np.random.default_rng(0).normal(size=first.joints.shape))
-    more = [replace(second, base='base_B', tool='tool_B')]
-    problem = Problem(UR, replace(first, approach=signs), more=more, effects=['backlash'])
-    result = identify(replace(problem, sigma_position=1e-5, sigma_orientation=4e-5))
-    assert not result.noise.consistent
-    assert result.refusals == ()
-
-
 def test_the_share_explained_is_that_of_least_squares():
     added = effects.members(UR, 'coupling')
     true = arm(3).with_effect_values(dict.fromkeys(added, 2e-3))

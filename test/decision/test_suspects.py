@@ -56,6 +56,9 @@ def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
     seen = measure(held, rail.random_joints(20, rng), rng)
     found = {each.what: (each.rank, each.part) for each in suspects(held, (seen,))}
     assert {what: found.get(what) for what in RANKS} == RANKS
+    assert (
+        'shoulder_pan_joint is not given against linear_axis_joint: they are coupled' not in found
+    )
     sister = replace(load_chain('ur5e'), base=None, tool=None)
     others = [e for e in suspects(sister, (seen.select(np.arange(0)),)) if 'arm is a' in e.what]
     assert {each.rank for each in others} == {2}
