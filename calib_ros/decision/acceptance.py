@@ -98,8 +98,9 @@ def _together(problem: Problem) -> str:
     own = joints[:, moved] - joints[:, moved].mean(axis=0)
     if len(own) > own.shape[1] > 1:
         _, sizes, ways = np.linalg.svd(own, full_matrices=False)
-        alike = names[moved][np.abs(ways[-1]) > EXCEPTION]
-        if len(alike) > 1 and sizes[-1] <= STILL * np.sqrt(len(own)):
+        still = ways[sizes <= STILL * np.sqrt(len(own))]
+        alike = names[moved][(np.abs(still) > EXCEPTION).any(axis=0)]
+        if len(alike) > 1:
             found += f'{", ".join(alike)} only moved together (if the arm couples them, give '
             found += 'their couplings and equal limits in the chain file): '
     least = np.linalg.norm((turns - turns.mean(axis=0)).reshape(-1, 3), -2) / len(turns) ** 0.5

@@ -89,7 +89,7 @@ def test_joints_that_the_poses_do_not_move_apart_are_told(still, alike, apart, t
     q[:, still] = 0.3 + 0.4 * STILL * rng.choice([-1.0, 1.0], (40, len(still)))
     if alike:
         q[:, alike] = q[:, alike[:1]] + apart * STILL * rng.normal(size=(40, len(alike)))
-        q[:, 3] += 0.5
+        q[:, alike] += 0.5 * np.arange(len(alike))
     problem = SimpleNamespace(chain=UR10E, sets=[SimpleNamespace(joints=q)])
     said = acceptance._together(problem)
     assert told in said
