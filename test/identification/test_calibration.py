@@ -89,7 +89,7 @@ def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nomi
     assert read.serial_of('c.yaml') == read.serial_of('c.yaml', '7') == '7'
 
 
-def test_the_nominal_chain_of_axes_that_coincide_has_no_b():
+def test_the_nominal_chain_of_axes_that_coincide_has_no_b_unless_given():
     rows = (Joint('table'), *UR.joints)
     nominal = Chain('turned', 'standard', rows)
     record = {'accepted': True, 'nominal': nominal_document(nominal)}
@@ -97,6 +97,9 @@ def test_the_nominal_chain_of_axes_that_coincide_has_no_b():
     assert parse_calibration(text, 'c.yaml').before.value('table.b') == 0.0
     with pytest.raises(ConfigError, match=r'another nominal chain, with table\.b 0 and not 0\.3'):
         parse_calibration(text, 'c.yaml', nominal.with_offsets({'table.b': 0.3}))
+    bent = nominal.with_offsets({'table.b': 0.3})
+    text = dump_chain(bent, {'accepted': True, 'nominal': nominal_document(bent)})
+    assert parse_calibration(text, 'c.yaml').before.value('table.b') == 0.3
 
 
 @pytest.mark.parametrize(

@@ -67,3 +67,9 @@ def test_an_arm_is_known_less_the_longer_it_was_not_measured():
     known = [recalibrate(previous, problem(UR10E, 8, 1), each).known_before for each in years]
     assert known[0] == known[1]
     assert (np.diff(known[1:]) > 0.0).all()
+
+
+def test_a_document_is_in_millimetres():
+    told = result(known_before=1e-4, known_after=2e-4, moved=3e-4).document()
+    keys = ('known_before_mm', 'known_after_mm', 'moved_mm')
+    assert [told[key] for key in keys] == pytest.approx([0.1, 0.2, 0.3])
