@@ -64,7 +64,7 @@ class LinearModel:
         blocks = np.full(int(self._groups.max(initial=-1)) + 1, -1)
         for each in numbers:  # every fold gets some of each set
             new = np.unique(each[blocks[each] < 0])
-            blocks[new] = np.arange(len(new)) * problem.folds // max(len(new), 1)
+            blocks[new] = np.arange(len(new)) * problem.folds // len(new)
         rows = self._rows(self._names)
         self._ends = np.cumsum([each[-1].size for each in rows])
         owner = owners(rows)
