@@ -12,6 +12,7 @@ import yaml
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.region import unpacked_matrix
 from calib_ros.errors import ConfigError
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration, load_calibration, parse_calibration
 from calib_ros.identification.identification import identify
@@ -74,6 +75,11 @@ def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nomi
     np.testing.assert_array_equal(replace(wavy, residual=None).remaining(q), sigma)
     wanted = np.maximum(sigma, np.hypot(known, found.residual))  # that has the waves
     np.testing.assert_allclose(wavy.remaining(q), wanted)
+    poses = Observations.from_arrays(q, np.zeros((200, 3)))
+    far = replace(found, unmodelled=found.unmodelled._replace(waves=1.0))
+    removed = float(np.sqrt(np.mean(found.removed(q)[0] ** 2)))  # no error may be larger
+    assert far.limit([poses]) == pytest.approx(removed, rel=0.05)
+    assert far.limit() == found.limit([poses]) == 1.5 * found.residual
     jacobian = ErrorModel(found.chain, found.names).jacobian(q)
     variances = np.einsum('ncp,pr,ncr->nc', jacobian, found.covariance, jacobian)
     bare = replace(read, region=None)
