@@ -136,9 +136,13 @@ def unseen(images: int, samples: Sequence[Sample], reason: str) -> list[Hint]:
     return [Hint('', words, explains=False)]
 
 
-def spoilt(samples: Sequence[Sample]) -> list[Hint]:
-    """Report samples of a lens that changed, or of two places."""
-    return [*_refocused(samples), *_scattered(samples)]
+def spoilt(samples: Sequence[Sample], known: Sequence[Hint]) -> list[Hint]:
+    """Report samples of a lens that changed, or of two places.
+
+    If a `known` hint explains motion at stops, that may be their scatter.
+    """
+    moved = any(hint.explains for hint in known)
+    return [*_refocused(samples), *([] if moved else _scattered(samples))]
 
 
 def _refocused(samples: Sequence[Sample]) -> list[Hint]:

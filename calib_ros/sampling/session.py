@@ -245,10 +245,10 @@ class CalibrationSession:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}', explains=False))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
-        silent = self._names.silent_ones(self._collector.track.silent())
-        found += [*silent, *spoilt(self.samples)]
-        found += unseen(self.pictures.dropped.total(), self.samples, self.pictures.reason)
+        found += self._names.silent_ones(self._collector.track.silent())
         found += self._pipeline.hints(self.received[POSES])
+        found += spoilt(self.samples, found)
+        found += unseen(self.pictures.dropped.total(), self.samples, self.pictures.reason)
         if any(hint.explains for hint in found):
             return found
         return found + (losses(self.received, self._dropped) or self._pipeline.unsettled())
