@@ -56,7 +56,7 @@ def parse_number(
     except (ValueError, OverflowError):
         number = math.nan
     if isinstance(value, bool) or not math.isfinite(number):
-        raise error(f'{where} must be a finite number, not {value!r}')
+        raise error(f'{where} must be a finite number, not {value!r:.100}')
     if abs(number) > largest:
         raise error(f'{where} must be at most {largest:g}, not {number:g}')
     return number
@@ -112,7 +112,7 @@ def parse_name(value: object, where: str) -> str:
     name = str(value)
     if not name.isprintable() or len(name) > LONGEST_NAME:
         raise ConfigError(
-            f'{where} must be printable and have at most {LONGEST_NAME} characters, not {name!r}'
+            f'{where} must be printable, of at most {LONGEST_NAME} characters, not {name!r:.100}'
         )
     return name
 
@@ -122,7 +122,7 @@ def parse_numbers(
 ) -> NDArray[np.float64]:
     """Return finite numbers (count,) from YAML; errors name them `where`."""
     if not isinstance(value, list) or len(value) != count:
-        raise error(f'{where} must be a list of {count} numbers, not {value!r}')
+        raise error(f'{where} must be a list of {count} numbers, not {value!r:.100}')
     return np.array([parse_number(item, where, error) for item in value])
 
 

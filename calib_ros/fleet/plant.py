@@ -69,7 +69,7 @@ def parse_plant(text: str, folder: Path, where: str = 'plant file') -> tuple[Rob
     content = parse_mapping(parse_yaml(text, where), KEYS['the plant'], where)
     groups = content.get('groups') or {}
     if not isinstance(groups, dict):
-        raise ConfigError(f'{where}: groups must be a mapping of names, not {groups!r}')
+        raise ConfigError(f'{where}: groups must be a mapping of names, not {groups!r:.100}')
     groups = {
         str(name): parse_mapping(values, KEYS['a group'], f'{where}: group {name}')
         for name, values in groups.items()

@@ -95,10 +95,10 @@ class Record:
         number = isinstance(rms, int | float) and not isinstance(rms, bool)
         if not number or not 0.0 <= rms < math.inf:
             raise ConfigError(
-                f'{where}: calibration.rms_mm_after must be a length [mm], not {rms!r}'
+                f'{where}: calibration.rms_mm_after must be a length [mm], not {rms!r:.100}'
             )
         if not isinstance(frame, str):
-            raise ConfigError(f'{where}: calibration.world_frame must be a name, not {frame!r}')
+            raise ConfigError(f'{where}: calibration.world_frame must be text, not {frame!r:.100}')
         return cls(record, where)
 
     def _part(self, key: str) -> dict[str, Any]:
@@ -313,8 +313,7 @@ class Fingerprint:
             least = np.frombuffer(bytes.fromhex(record['rows']['least']), '>u8')
             return cls(int(record['rows']['count']), least.astype(np.uint64))
         except (KeyError, TypeError, ValueError) as err:
-            what = f'{where}: calibration.rows is not as it was written'
-            raise ConfigError(f'{what}: {err}') from err
+            raise ConfigError(f'{where}: calibration.rows is damaged: identify again') from err
 
     def document(self) -> dict[str, Any]:
         """Return the fingerprint for the record."""

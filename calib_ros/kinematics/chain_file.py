@@ -138,7 +138,9 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
         raise ConfigError(f'{where}: {len(rows)} joints are more than {MOST_NAMES}')
     parallel = content.get('parallel')
     if parallel is not None and not (isinstance(parallel, list) and _texts(parallel)):
-        raise ConfigError(f'{where}: "parallel" must be a list of joint names, not {parallel!r}')
+        raise ConfigError(
+            f'{where}: "parallel" must be a list of joint names, not {parallel!r:.80}'
+        )
     gravity = content.get('gravity')
     gravity = list(Chain.gravity) if gravity is None else gravity
     x, y, z = parse_numbers(gravity, 3, f'{where}: gravity').tolist()
@@ -266,7 +268,7 @@ def dictionary(value: object, where: str) -> dict[str, Any]:
     if value is None:
         return {}
     if not isinstance(value, dict) or not _texts(value):
-        raise ConfigError(f'{where} must be a mapping of names, not {value!r}')
+        raise ConfigError(f'{where} must be a mapping of names, not {value!r:.100}')
     return value
 
 
