@@ -124,6 +124,7 @@ class Layout:
     shift: int = 0  # rows by which joint values are below their measurement
     comment: str = ''  # start of lines to ignore
     sheet: str = ''  # of a workbook
+    insisted: tuple[str, ...] = ()  # options given, whose units hold against the header's
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -176,7 +177,7 @@ def load_layout(name_or_path: str) -> Layout:
         if name_or_path not in shipped:
             raise UnknownNameError('preset (or path of a .yaml)', name_or_path, sorted(shipped))
         path = shipped[name_or_path]
-    known = [item.name for item in fields(Layout)]
+    known = [item.name for item in fields(Layout) if item.name != 'insisted']
     content = parse_mapping(parse_yaml(read_text(path), str(path)), known, str(path))
     if isinstance(columns := content.get('columns'), dict):
         content['columns'] = {str(k): str(v) for k, v in columns.items()}
@@ -232,4 +233,4 @@ def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> 
                 known, defined = dict(merged), set()
             merged[ours] = theirs if ours in WORDS else _in_their_names(theirs, known)
             defined.add(ours)
-    return replace(layout, columns=merged, **changes)
+    return replace(layout, columns=merged, insisted=(*changes,), **changes)

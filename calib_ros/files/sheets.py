@@ -47,11 +47,11 @@ LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """The rows of a table in columns `#1`, `#2` ..., their names, and the cells `above`."""
+    """The rows of a table in columns `#1`, `#2` ..., their names, and the lines `above`."""
 
     path: Path
     header: tuple[str, ...]
-    above: tuple[tuple[str, ...], ...]
+    above: tuple[str, ...]
     columns: Columns
     notes: tuple[str, ...]
 
@@ -74,6 +74,7 @@ class _Content:
     rows: Iterator[list[Cells]]
     notes: list[str]
     title: str = ''
+    comments: Sequence[str] = ()
 
 
 def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence[str]) -> Sheet:
@@ -106,8 +107,10 @@ def _of_text(path: Path, layout: Layout) -> _Content:
     notes = [f'the text is read as {coding}'] if coding else []
     if '\r' in text:
         text = text.replace('\r\n', '\n').replace('\r', '\n')
+    comments: list[str] = []
     if layout.comment:
-        text = re.sub(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$', '', text)
+        comment = re.compile(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$')
+        comments, text = comment.findall(text), comment.sub('', text)
     text = re.sub(r'(?m)^[#%]+[ \t]+(?=[A-Za-z])', '', text)  # a header, as numpy writes it
     guessed = _separator(path, text, notes if not layout.cut else [])
     separator = layout.cut or guessed
@@ -118,7 +121,7 @@ def _of_text(path: Path, layout: Layout) -> _Content:
             f'{path} separates its cells by {name}s: give --separator {name}'
             + ', or to --joints-preset a layout of your own' * bool(layout.source)
         )
-    return _Content(_rows_of_text(path, narrow, separator), notes)
+    return _Content(_rows_of_text(path, narrow, separator), notes, comments=comments)
 
 
 def _rows_of_text(path: Path, text: str, separator: str) -> Iterator[list[Cells]]:
@@ -152,13 +155,15 @@ def _sheet(
     if at < 0 and first:  # columns by their numbers
         header = tuple(f'#{k + 1}' for k in range(len(head[first][1])))
     header = _with_units(header, [cells for _, cells in head[at + 1 : first]])
-    above = tuple(tuple(cells) for _, cells in head[: max(at, 0)])
+    above = [' '.join(cells) for _, cells in head[: first if at < 0 else at]]
     body = chain([whole[first:]], rows)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
     if at >= 0 and max(used, default=0) < len(header):
         _refuse_shifted(columns, len(header))
     header = (*header, *[''] * (len(columns.header) - len(header)))
-    return Sheet(path, header, above, replace(columns, decimal=decimal), tuple(notes))
+    return Sheet(
+        path, header, (*content.comments, *above), replace(columns, decimal=decimal), tuple(notes)
+    )
 
 
 def _refuse_shifted(columns: Columns, width: int) -> None:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 from calib_ros.errors import InputError
@@ -44,45 +45,58 @@ class Units:
         slides = [name for name in joints if types[int(name[1:]) - 1 :][:1] == ['prismatic']]
         turns = [name for name in joints if name not in slides]
         main = [name for name in turns if name[0] == 'q']
-        length = self._above(layout.length)
-        found = self._told('length', length, (*POSITION, 'distance'), (*slides, *SIGMAS[:3]))
-        angles = self._told('angle', layout.angle, (*TURNS, *IN_TURN), SIGMAS[3:])
+        given: dict[str, str] = {name: getattr(layout, name) for name in layout.insisted}
+        angle, usual = given.get('angle', ''), self._above('angles', ANGLES, layout.angle)
+        found = self._told(
+            'length',
+            given.get('length', ''),
+            self._above('lengths', LENGTHS, layout.length),
+            (*POSITION, 'distance'),
+            (*slides, *SIGMAS[:3]),
+        )
+        angles = self._told('angle', angle, usual, (*TURNS, *IN_TURN), SIGMAS[3:])
         said = {self._said(name) for name in angles} - {''}
-        given = layout.joint_angle or layout.angle
-        if not given and len(said) == 1 and not any(map(self._said, turns)):
-            given = said.pop()
         found |= angles | self._told(
-            'joint-angle', given, main, [n for n in turns if n not in main]
+            'joint-angle',
+            given.get('joint_angle', '' if layout.joint_angle else angle),
+            layout.joint_angle or usual or (said.pop() if len(said) == 1 else ''),
+            main,
+            [n for n in turns if n not in main],
         )
         self.factors = {name: (LENGTHS | ANGLES)[unit] for name, unit in found.items()}
         """Factors of our columns to m and rad."""
         if self._assumed:
             self.notes.append(f'no units are given: taking {", ".join(self._assumed)}')
 
-    def _above(self, length: str) -> str:
-        """Return the unit of lengths: beside `Length Units` above the header, or the given one."""
-        for cells in self._sheet.above:
-            if 'Length Units' in cells[:-1]:
-                unit = UNIT_SIGNS.get(cells[cells.index('Length Units') + 1].lower(), '')
-                if unit in LENGTHS and unit != length:
-                    self.notes.append(f'lengths are in {unit}, as its head says')
-                    length = unit
-        return length
+    def _above(self, what: str, units: Mapping[str, float], usual: str) -> str:
+        """Return the one of some units that the lines above the header tell, or the usual one."""
+        for line in self._sheet.above:
+            for words in re.findall(r'\bunits?\b\W*(\w+)\W*(\w*)', line, re.I):
+                told = [UNIT_SIGNS.get(word.lower(), '') for word in words]
+                if known := [unit for unit in told if unit in units]:
+                    if known[-1] != usual:  # the last: `units in mm`
+                        self.notes.append(f'{what} are in {known[-1]}, as its head says')
+                    return known[-1]
+        return usual
 
     def _told(
-        self, option: str, given: str, main: Sequence[str], more: Sequence[str]
+        self, option: str, given: str, usual: str, main: Sequence[str], more: Sequence[str]
     ) -> dict[str, str]:
-        """Return the units of our columns of a kind: given, in the header, or of the main ones."""
-        what, _, usual = OPTIONS[option]
+        """Return the units of our columns of a kind: given, in the header, or of the main ones.
+
+        Columns of which the header says nothing have the `usual` unit, if any.
+        """
+        what, _, assumed = OPTIONS[option]
         said = {name: self._said(name) for name in (*main, *more) if name in self._columns}
         for name, unit in said.items():
             self._check(name, unit, option, given)
+        other = given or usual
+        self.notes += [
+            f'its header says {unit}, but {other} is given: taking {given or unit}'
+            for unit in dict.fromkeys(said.values())
+            if other and unit not in ('', other)
+        ]
         if given:
-            self.notes += [
-                f'its header says {unit}, but {given} is given: taking {given}'
-                for unit in dict.fromkeys(said.values())
-                if unit not in ('', given)
-            ]
             return dict.fromkeys(said, given)
         found = {said[name] for name in main if name in said} - {''}
         bare = [name for name, unit in said.items() if not unit]
@@ -92,9 +106,9 @@ class Units:
                 f'{" and ".join(sorted(found))}: write it in the header, or convert them '
                 f'(--columns) and give --{option}'
             )
-        if bare and not found:
-            self._assumed.append(f'{what} in {usual} (--{option})')
-        return {name: unit or next(iter(found), usual) for name, unit in said.items()}
+        if bare and not found and not usual:
+            self._assumed.append(f'{what} in {assumed} (--{option})')
+        return {name: unit or next(iter(found), usual or assumed) for name, unit in said.items()}
 
     def _check(self, ours: str, unit: str, option: str, given: str) -> None:
         """Refuse a unit of another kind, or an unknown one if none is given.

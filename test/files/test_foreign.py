@@ -15,7 +15,7 @@ from calib_ros import load_chain, read_table
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.files import sheets
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import Layout, load_layout
+from calib_ros.files.layouts import Layout, layout_of, load_layout
 
 JOINTS = np.array([[0.1, -0.2], [0.3, 0.4], [-1.5, 2.0]])
 PLACES = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 0.125], [0.0, -1.0, 1e-3]])
@@ -222,6 +222,28 @@ def test_exports_of_others(run, tmp_path, preset):
         np.testing.assert_allclose(found.joints[:, 2], JOINTS[:, 0], atol=1e-12)
     if preset != 'spatialanalyzer':
         np.testing.assert_allclose(found.rotations, TURNED.as_matrix(), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('preset', 'old', 'new', 'factor'),
+    [
+        ('vicon', ',mm,mm,mm\n', ',m,m,m\n', 1.0),
+        ('vicon', 'TX,TY,TZ\n,,,,,,mm,mm,mm\n', 'TX [m],TY [m],TZ [m]\n', 1.0),
+        ('vicon', 'Objects\n', 'Units in meters\n', 1e-3),  # the header says mm
+        ('spatialanalyzer', '// Spatial', '// Units: Inches\n// Spatial', 0.0254),
+        ('spatialanalyzer', '// Spatial', '// Length Units = m, Angle: deg\n// Spatial', 1.0),
+        ('optitrack', 'Millimeters', 'Meters', 1.0),
+    ],
+)
+def test_a_file_tells_its_units_better_than_a_preset(tmp_path, preset, old, new, factor):
+    text, log = exports()[preset]
+    (tmp_path / 'table.csv').write_text(text.replace(old, new))
+    (tmp_path / 'log.csv').write_text(log)
+    for given, unit in (({}, factor), ({'length': 'cm'}, 0.01)):  # an option is an order
+        layout, of_log = layout_of(preset, [], given), layout_of('kuka', [], {})
+        foreign = Foreign(layout, None, tmp_path / 'log.csv', of_log)
+        (found,) = read_table(tmp_path / 'table.csv', 2, foreign=foreign).fitted
+        np.testing.assert_allclose(found.positions, 1e3 * unit * PLACES, atol=1e-12)
 
 
 def test_the_only_row_may_end_without_a_line_break(read):

@@ -116,7 +116,9 @@ def test_a_linear_axis_has_its_own_unit_in_the_header(tmp_path):
     path.write_text('rail [mm],turn [°],X [mm],Y [mm],Z [mm]\n1500,90,1,2,3\n')
     chain = Chain('arm', 'standard', (Joint('rail', type='prismatic'), Joint('turn', a=0.3)))
     (found,) = loading.table(path, chain, Settings()).fitted
-    cm = loading.table(path, chain, Settings(), foreign=Foreign(Layout(length='cm'), chain))
+    cm = loading.table(
+        path, chain, Settings(), foreign=Foreign(layout_of('', [], {'length': 'cm'}), chain)
+    )
     assert 'its header says mm, but cm is given: taking cm' in str(cm.warnings)
     np.testing.assert_allclose(found.joints, [[1.5, np.pi / 2]])
     np.testing.assert_allclose(found.positions, [[1e-3, 2e-3, 3e-3]])
