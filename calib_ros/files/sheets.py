@@ -111,7 +111,8 @@ def _of_text(path: Path, layout: Layout) -> _Content:
     if layout.comment:
         comment = re.compile(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$')
         comments, text = comment.findall(text), comment.sub('', text)
-    text = re.sub(r'(?m)^[#%]+[ \t]+(?=[A-Za-z])', '', text)  # a header, as numpy writes it
+    # a header, as numpy and SpatialAnalyzer write it
+    text = re.sub(r'(?m)^(?:[#%]+[ \t]+|//[ \t]*)(?=[A-Za-z])', '', text)
     guessed = _separator(path, text, notes if not layout.cut else [])
     separator = layout.cut or guessed
     narrow = _narrow(text, separator)

@@ -26,7 +26,7 @@ from calib_ros.errors import ColumnsError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import Codes, Columns, columns_of, measured
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.headers import joints_left_out, not_read
+from calib_ros.files.headers import joints_left_out, like_joints, not_read
 from calib_ros.files.journal import columns, of_journal
 from calib_ros.files.measurements import Measurements, distinct_rows, measurements
 from calib_ros.files.vocabulary import MATRIX, QUATERNION, TURNS, WORDS, joint_columns
@@ -153,8 +153,12 @@ def check_table(made: Columns) -> None:
     """Refuse columns that no table may have: any sessions, with as many joints as there are."""
     joints = sum(re.fullmatch('q[0-9]+', name) is not None for name in made.cells)
     if not joints:
+        like = (like_joints(made.theirs, count) for count in range(9, 2, -1))
+        given = ','.join(
+            '='.join(each) for each in next(filter(None, like), {'q1': '...'}).items()
+        )
         raise InputError(
-            f'{made.path} has no joint values: name their columns (--columns q1=...), give the '
+            f'{made.path} has no joint values: name their columns (--columns "{given}"), give the '
             'chain with those joint names (--chain), or their separate table (--joints)'
         )
     sessions = made.texts('session') if 'session' in made.cells else ()

@@ -328,11 +328,19 @@ def test_faults_are_named(read, text, layout, said):
         read(text, **layout)
 
 
-def test_a_table_without_joint_values_is_refused(run, tmp_path):
-    (tmp_path / 'cell.csv').write_text('x,y,z\n1,2,3\n')
+@pytest.mark.parametrize(
+    ('names', 'proposed'), [('', 'q1=...'), (',J1,J2,J3 [deg]', 'q*=J*'), (',A0,A1,A2', 'q1=A0,')]
+)
+def test_a_table_without_joint_values_is_refused(run, tmp_path, names, proposed):
+    (tmp_path / 'cell.csv').write_text(f'x,y,z{names}\n1,2,3{",4" * names.count(",")}\n')
     status, _, err = run('import', 'cell.csv', '--out', 'out.csv')
     assert status == 1
-    assert 'cell.csv has no joint values: name their columns' in err
+    assert f'cell.csv has no joint values: name their columns (--columns "{proposed}' in err
+
+
+@pytest.mark.parametrize('mark', ['# ', '// ', '//', '% '])
+def test_a_header_may_look_like_a_comment(read, mark):
+    assert_same(read(mark + PLAIN), None)
 
 
 def test_axes_called_like_accelerations_are_none(run, tmp_path):
