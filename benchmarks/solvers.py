@@ -109,18 +109,12 @@ class Streamed:
         self.count = given.facts['poses']
         self.rows = self.count * (6 if given.oriented else 3)
 
-    def parts(self, chain, names):
-        """Yield weighted rows of Jacobian and residual; see `samples.Samples`."""
-        from calib_ros.estimation.samples import Samples
-
-        for chunk in self.given.chunks():
-            yield from Samples(_observations(self.given, chunk), *self.sigmas).parts(chain, names)
-
     def products(self, *which):
-        """Return the products of all rows."""
+        """Return the products of all rows; see `samples.Samples`."""
         from calib_ros.estimation.samples import Samples
 
-        return Samples.products(self, *which)
+        read = (_observations(self.given, chunk) for chunk in self.given.chunks())
+        return sum(Samples(each, *self.sigmas).products(*which) for each in read)
 
 
 def streamed(given):
