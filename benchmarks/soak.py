@@ -60,7 +60,7 @@ from std_srvs.srv import Trigger
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.sampling.messages import NO_STAMP
+from calib_ros.sampling.message_filter import NO_STAMP
 from calib_ros.sampling.sample import Sample
 
 LEG = 1.2
