@@ -99,6 +99,8 @@ def near(name: str, alternatives: Iterable[str], least: float = 0.5) -> str:
 def unreadable(path: Path, err: OSError, what: str = '') -> str:
     """Return why a file, described by `what`, is not read, and a similar name."""
     text = f'cannot read {what}{path}: {err.strerror or err}'
+    if path.is_symlink():
+        return f'{text} (the link leads to {path.readlink()})'
     if not isinstance(err, FileNotFoundError) or not path.parent.is_dir():
         return text
     some = islice(path.parent.iterdir(), MOST_ENTRIES)

@@ -7,9 +7,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import timedelta
+from itertools import pairwise
+from statistics import median_low
 
 from calib_ros.apply.confidence import Drift, drift
 from calib_ros.errors import CalibrationError
+from calib_ros.estimation.levels import SEVERAL
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
@@ -156,18 +160,31 @@ def _without_twins(found: Sequence[RobotStatus]) -> Iterator[RobotStatus]:
         yield replace(one, errors=errors)
 
 
+def _silent(found: Sequence[RobotStatus]) -> Iterator[RobotStatus]:
+    """Yield statuses; those without several usual nights before the newest of all are told."""
+    newest = max((one.last.time for one in found if one.last is not None), default=None)
+    for one in found:
+        times = [night.row.time for night in one.watched.nights]
+        if newest is not None and one.last is not None and len(times) >= SEVERAL:
+            usual = max(median_low(b - a for a, b in pairwise(times)), timedelta(days=1))
+            if newest - one.last.time > SEVERAL * usual:
+                silence = f'nothing measured since {one.last.time:%Y-%m-%d}; other robots were'
+                one = replace(one, remarks=(*one.remarks, silence))
+        yield one
+
+
 def statuses(
     robots: Sequence[Robot], history: History, done: Run, years: float
 ) -> tuple[RobotStatus, ...]:
     """Return the states of robots, worst first."""
-    found = _without_twins([RobotStatus.of(robot, history, done, years) for robot in robots])
+    found = [RobotStatus.of(robot, history, done, years) for robot in robots]
     order = list(STATES)
 
     def rank(one: RobotStatus) -> tuple[int, float, float, str]:
         rms = (one.last and one.last.rms_mm) or 0.0
         return order.index(one.state), -one.share, -rms, one.robot.serial
 
-    return tuple(sorted(found, key=rank))
+    return tuple(sorted(_silent([*_without_twins(found)]), key=rank))
 
 
 def counts(found: Sequence[RobotStatus]) -> dict[str, int]:

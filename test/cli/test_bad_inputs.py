@@ -21,6 +21,7 @@ def bad_inputs():
         (*csv_of, 'jugs.csv'),
         'cannot read jugs.csv: No such file or directory\n',
     )
+    yield 'a link to nothing', (*csv_of, 'link.csv'), '(the link leads to gone.csv)\n'
     yield 'a column twice', (*csv_of, 'twice.csv'), 'are called x: rename all but one'
     yield 'too few rows', (*csv_of, 'few.csv'), 'too few different poses: 3 measured'
     yield 'only test rows', (*csv_of, 'judging.csv'), 'judging.csv has no rows to fit'
@@ -98,6 +99,7 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     write_csv(tmp_path / 'few.csv', rows[:3])
     write_csv(tmp_path / 'judging.csv', rows[TRAIN:])
     (tmp_path / 'twice.csv').write_text('q1,q2,q3,q4,q5,q6,x,y,z,x\n0,0,0,0,0,0,1,2,3,4\n')
+    (tmp_path / 'link.csv').symlink_to('gone.csv')
     (tmp_path / 'empty').write_text('')
     (tmp_path / 'broken.yaml').write_text('joints: [\n')
     (tmp_path / 'move.dat').write_text('&ACCESS RVP\nDEFDAT MOVE\nENDDAT\n')

@@ -190,6 +190,22 @@ def test_a_clock_that_is_wrong_hides_no_newer_night(plant, tmp_path):
     )
 
 
+def test_a_robot_without_the_nights_of_the_others_is_told_of(plant, tmp_path):
+    history = History(tmp_path / 'history')
+    about = {'kind': 'identify', 'verdict': 'accepted', 'chain': CHAIN}
+    for robot, last in zip(plant[:2], (3, 7), strict=True):
+        for k in range(last + 1):
+            at = (plants.when(k), f'{robot.serial}{k}', robot.settings_hash)
+            history.file(Row(robot.serial, *at, filed=plants.when(k), **about))
+        remarks = [each.remarks for each in statuses(plant[:2], history, Run(), 100.0)]
+        if robot is plant[0]:
+            assert remarks == [(), ()]  # the newest, and one never measured
+    told = {each.robot.serial: each.remarks for each in statuses(plant[:2], history, Run(), 100.0)}
+    assert told == {'A': ('nothing measured since 2025-10-12; other robots were',), 'B': ()}
+    history.file(replace(history.rows('A')[-1], time=plants.when(4), inputs='late'))
+    assert not any(each.remarks for each in statuses(plant[:2], history, Run(), 100.0))
+
+
 def test_poses_verified_twice_count_once(plant, tmp_path):
     errors = {'rms_mm': 0.1, 'rms_freedom': 30.0}
     about = {'kind': 'verify', 'verdict': 'holds', 'chain': '{}'}
