@@ -81,6 +81,21 @@ def archived(plant):
     plant.write_text(json.dumps(content))
 
 
+def row_ms(history, copy):
+    """Return the time [ms] to file a row, to read it, and to read it from the cache."""
+    serials = history.serials()
+    rows = [row for serial in serials for row in history.rows(serial)]
+    clock = [time.monotonic()]
+    for row in rows:
+        copy.file(row)
+    clock.append(time.monotonic())
+    for _ in ('files', 'cache'):
+        for serial in serials:
+            copy.rows(serial)
+        clock.append(time.monotonic())
+    return dict(zip(('filed', 'read', 'cached'), 1e3 * np.diff(clock) / len(rows), strict=True))
+
+
 def nights_part(folder, robots, nights, number, cluster):
     """Return what two runs over a plant find and take."""
     serials = [f'R{k:03}' for k in range(robots)]
@@ -131,6 +146,7 @@ def nights_part(folder, robots, nights, number, cluster):
         'first_run_s': spans[0],
         'second_run_s': spans[1],
         'row_bytes': float(np.mean(files)),
+        'row_ms': row_ms(history, History(folder / 'copy')),
         'page_bytes': float(np.mean(pages)),
         'input_bytes': (folder / 'nights/R000/000.csv').stat().st_size,
         'alarms': said,
