@@ -109,7 +109,8 @@ def test_a_few_rows_in_another_unit_are_named(rows, where, oriented):
         assert found.startswith(f'in lines {where} alone, the {words}, not ')
     many = Problem(arm, replace(seen, joints=np.where(some, np.degrees(q), q)), of_messages=True)
     told = str(explained_alone(many, true))
-    assert told.startswith(f'in lines {where} alone, the joint values are in degrees, not ')
+    place = f'in poses {where} of 40 alone'
+    assert told.startswith(f'{place}, the joint values are in degrees, not ')
     assert ': correct the publisher and measure again' in told
 
 
