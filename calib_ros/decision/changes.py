@@ -16,11 +16,11 @@ device has changed. It reduces chi-squared, with as many degrees of freedom as z
 
 A change is claimed if chance gains as much, over all explanations tried, with probability FALSE at
 most (Bonferroni). Explanations are compared by their evidence with z ~ N(0, s^2 S), S the typical
-size of changes, which penalises additional parameters (MacKay 1992). A motor that is a turn off,
-or a belt a tooth, changes far more: s is the likeliest of 1, SPREAD and SPREAD^2. Each joint and
-each frame is as likely as another beforehand, however many explanations it has (the many of joints
-would outweigh a frame that has moved); load and scale are as likely as one parameter of a joint.
-Those with a share above 1 - CONFIDENT are indistinguishable from the best.
+size of changes, which penalises additional parameters (MacKay 1992). s is the likeliest of 1,
+SPREAD and, for zeros and frames, SPREAD^2: a motor may be a turn off, or a belt a tooth. Each
+joint and each frame is as likely as another beforehand, whatever the number of its explanations
+(joints have many); load and scale are as likely as one parameter of a joint. Those with a share
+above 1 - CONFIDENT are indistinguishable from the best.
 """
 
 from __future__ import annotations
@@ -170,18 +170,6 @@ class Information(Shown):
         along = root.T @ (columns.T @ self.vector)
         rank = max(1, int(root.any(axis=0).sum()))
         return float(along @ along), root @ along, root @ root.T, rank
-
-    def evidence(self, columns: FloatArray, sizes: FloatArray) -> tuple[float, float]:
-        """Return the log evidence of changes along columns (P, k), and how many `sizes` (k,)."""
-        scaled = columns * sizes
-        inner, seen = scaled.T @ self.matrix @ scaled, scaled.T @ self.vector
-        found = []
-        for k in range(SEVERAL):
-            times = SPREAD**k
-            whole = np.eye(len(sizes)) + times**2 * inner
-            gain = times**2 * float(seen @ np.linalg.solve(whole, seen))
-            found.append((0.5 * (gain - float(np.linalg.slogdet(whole)[1]) - k**2), times))
-        return max(found)
 
 
 def root_of(square: FloatArray) -> FloatArray:
@@ -346,7 +334,15 @@ class Effects:
         self, information: Information, names: Sequence[Parameter]
     ) -> tuple[float, float]:
         """Return the log evidence of changes of k parameters, and how many typical ones."""
-        return information.evidence(self.of(names), _sizes(names))
+        columns, sizes, found = self.of(names), _sizes(names), []
+        stiff = [name.of_dh and name not in self.zeros for name in names]
+        for k in range(SEVERAL):
+            scaled = columns * sizes * SPREAD ** np.where(stiff, min(k, 1), k)
+            whole = np.eye(len(names)) + scaled.T @ information.matrix @ scaled
+            seen = scaled.T @ information.vector
+            gain = float(seen @ np.linalg.solve(whole, seen))
+            found.append((0.5 * (gain - float(np.linalg.slogdet(whole)[1]) - k**2), SPREAD**k))
+        return max(found)
 
     def spread(self, changed: Sequence[Sequence[Explanation]]) -> FloatArray:
         """Return the prior covariance (P, P) of changes whose sizes the data determine."""

@@ -58,13 +58,22 @@ def test_turns_count_where_those_of_the_target_are_known(names, free, lever, mon
     assert told == [lever]
 
 
-@pytest.mark.parametrize(('size', 'times'), [(1.0, 1.0), (5.0, 10.0), (1e3, 100.0)])
-def test_a_change_is_as_large_as_its_evidence_tells(size, times):
+@pytest.mark.parametrize(
+    ('kind', 'size', 'times'),
+    [
+        ('theta', 1.0, 1.0),
+        ('theta', 5.0, 10.0),
+        ('theta', 1e3, 100.0),
+        ('alpha', 5.0, 10.0),
+        ('alpha', 1e3, 10.0),  # no belt slips there
+    ],
+)
+def test_a_change_is_as_large_as_its_evidence_tells(kind, size, times):
     """The evidence is that of one number, here known to a tenth of the typical change."""
-    names = (Parameter('elbow.theta'),)
-    information = Information(names, np.array([[100.0]]), np.array([100.0 * size]))
-    evidence, found = information.evidence(np.eye(1), np.ones(1))
-    assert found == times
+    name, known = Parameter('elbow', kind), 10.0 / changes.SIZES['rad']
+    found = np.array([[known**2]]), np.array([10.0 * known * size])
+    evidence, told = Effects(SCARA, [name]).evidence(Information((name,), *found), [name])
+    assert told == times
     spread = 1.0 + 100.0 * times**2
     gain = 100.0**2 * size**2 * times**2 / spread
     seldom = np.log10(times) ** 2
