@@ -84,7 +84,7 @@ class Record:
             raise ConfigError(
                 f'{where} was not accepted: identify again, from more or better poses'
             )
-        unset = {key for key, value in record.items() if value is None and key != 'region'}
+        unset = {key for key, value in record.items() if value in (None, {}) and key != 'region'}
         missing = [key for key in ALWAYS if key not in record or key in unset]
         if missing and {'created', 'software'} & set(record):
             raise ConfigError(

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A calibration in its file: all that was known is known again."""
 
+import re
 from copy import deepcopy
 from dataclasses import replace
 
@@ -171,6 +172,9 @@ def test_a_file_that_was_cut_off_is_refused(found):
     with pytest.raises(ConfigError, match=r'c\.yaml is cut off: its record lacks table_sha256, '):
         parse_calibration(cut, 'c.yaml', UR)
     assert parse_calibration(text.rstrip(), 'c.yaml', UR).region is not None
+    emptied = re.sub(r'(?ms)^  nominal:\n.*?(?=^  \w)', '  nominal: {}\n', text)
+    with pytest.raises(ConfigError, match='its record lacks nominal'):
+        parse_calibration(emptied, 'c.yaml', UR)
 
 
 @pytest.mark.parametrize(
