@@ -33,6 +33,7 @@ from calib_ros.kinematics.chain_file import (
 from calib_ros.kinematics.parameter import DH_KINDS, ROW_KINDS
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import Settings
+from calib_ros.shown import some
 from calib_ros.values import parse_like, parse_number, parse_numbers
 
 Owner: TypeAlias = tuple[str, bool, bool, str]
@@ -160,9 +161,7 @@ class Record:
             length = angle = math.inf
         if differing := _differing(chain, nominal, length, angle):
             raise ConfigError(
-                f'{self.where} is not the calibration of this robot: {", ".join(differing)} '
-                f'differ from chain "{nominal.name}" by more than largest_length and '
-                'largest_angle allow'
+                f'{self.where} is not the calibration of chain "{nominal.name}": {differing}'
             )
 
     def _check_nominal(self, nominal: Chain) -> None:
@@ -251,19 +250,19 @@ class Record:
         return found
 
 
-def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> list[str]:
-    """Return the parameters that differ by more than errors of one robot [m, rad]."""
+def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> str:
+    """Return in words what differs by more than errors of one robot [m, rad]; empty if nothing."""
     if chain.convention != nominal.convention:
-        return [f'the conventions ({chain.convention}, {nominal.convention})']
-    names = []
+        return f'its convention is {chain.convention}, not {nominal.convention}'
     for joint, other in zip(chain.joints, nominal.joints, strict=True):
         if joint.sign != other.sign:
-            names.append(f'the sign of {joint.name}')
-        for name in joint.parameters:
-            limit = length if name.is_length else angle
-            if abs(chain.value(name) - nominal.value(name)) > limit:
-                names.append(name)
-    return names
+            return f'the sign of {joint.name} is {joint.sign}, not {other.sign}'
+    limits = {
+        name: length if name.is_length else angle for j in chain.joints for name in j.parameters
+    }
+    far = [n for n, most in limits.items() if abs(chain.value(n) - nominal.value(n)) > most]
+    beyond = 'too far from it (largest_length, largest_angle): '
+    return f'{beyond}{", ".join(some(far))}' * bool(far)
 
 
 def hashes(sets: Sequence[Observations]) -> Hashes:

@@ -234,7 +234,7 @@ GOOD = {'nominal': nominal_document(UR), 'rms_mm_after': 0.1, 'world_frame': 'tr
         ('ur10e', {}, 'is a chain, but not a calibration'),
         ('ur10e', {'accepted': False}, 'was not accepted'),
         ('puma560', {'samples': 3}, 'the nominal chain has .* are they the same arm'),
-        ('ur5e', {'samples': 3}, r'is not the calibration of this robot: .*elbow_joint\.a'),
+        ('ur5e', {'samples': 3}, r'is not the calibration of chain "ur5e": .*elbow_joint\.a'),
         ('ur10', {'nominal': nominal_document(load_chain('ur10e'))}, r'\.d 0.1807 and not 0.1273'),
         ('ur10e', {'nominal': {'convention': 'standard'}}, 'must be a list of 5 numbers'),
         ('ur10e', {'nominal': 'ur10e'}, 'must be a mapping'),
@@ -269,11 +269,11 @@ def test_a_record_in_another_convention_is_taken_as_it_is():
 def test_a_calibration_too_far_from_its_nominal_chain_is_refused():
     nominal = load_chain('ur5e')
     far = calibrated_text(nominal.with_offsets({'elbow_joint.theta': 0.2}), {'samples': 3})
-    with pytest.raises(ConfigError, match=r'of this robot: elbow_joint\.theta'):
+    with pytest.raises(ConfigError, match=r'of chain "ur5e": too far .*: elbow_joint\.theta'):
         parse_calibration(far, 'c.yaml', nominal)
     parse_calibration(far, 'c.yaml', nominal, Settings(largest_angle=0.3))
     near = calibrated_text(nominal, {'samples': 3})
-    with pytest.raises(ConfigError, match='conventions'):
+    with pytest.raises(ConfigError, match='its convention is standard, not modified'):
         parse_calibration(near, 'c.yaml', replace(nominal, convention='modified'))
 
 
@@ -285,7 +285,7 @@ def test_a_large_error_of_the_nominal_chain_itself_was_judged_when_it_was_identi
     assert parse_calibration(far, 'c.yaml', nominal).chain.value('elbow_joint.theta') == (
         pytest.approx(true.value('elbow_joint.theta'))
     )
-    with pytest.raises(ConfigError, match=r'of this robot: elbow_joint\.theta'):
+    with pytest.raises(ConfigError, match=r'of chain "ur5e": too far .*: elbow_joint\.theta'):
         parse_calibration(far, 'c.yaml', nominal, Settings())
     elbow = nominal.joint_names.index('elbow_joint')
     joints = list(nominal.joints)
