@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 
 from calib_ros.errors import InputError
@@ -20,6 +19,7 @@ from calib_ros.files.vocabulary import (
     SIGMAS,
     TURNS,
     UNIT_SIGNS,
+    UNITS_ARE,
 )
 from calib_ros.kinematics.chain import Chain
 
@@ -71,10 +71,10 @@ class Units:
     def _above(self, what: str, units: Mapping[str, float], usual: str) -> str:
         """Return the one of some units that the lines above the header tell, or the usual one."""
         for line in self._sheet.above:
-            for words in re.findall(r'\bunits?\b\W*(\w+)\W*(\w*)', line, re.I):
+            for words in UNITS_ARE.findall(line):
                 told = [UNIT_SIGNS.get(word.lower(), '') for word in words]
                 if known := [unit for unit in told if unit in units]:
-                    if known[-1] != usual:  # the last: `units in mm`
+                    if known[-1] != usual:  # the last: `units: in mm`
                         self.notes.append(f'{what} are in {known[-1]}, as its head says')
                     return known[-1]
         return usual

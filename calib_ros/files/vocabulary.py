@@ -23,6 +23,10 @@ _ANY = '|'.join(UNIT_SIGNS)
 _WORDS = '|'.join(sign for sign in UNIT_SIGNS if sign not in ('m', 'in'))
 UNIT = re.compile(rf'(.*[^\s,/_]) *(?:[\[(]([^\[\]()]+)[\])]|[,/] *({_ANY})|[_ ]({_WORDS}))', re.I)
 """A name with its unit: X [mm], X (mm), X / mm, X_mm; brackets may hold something else."""
+UNITS_ARE = re.compile(
+    rf'\bunits?\b(?:\W*[:=]\W*({_ANY})|\W*(?:are )?(?:in )?({_WORDS}))\b(?:\W+({_ANY})\b)?', re.I
+)
+"""Units in words: `Length Units = m`, `Units: mm, deg`, `units are in mm`."""
 SECONDS = ('', 's', 'sec', 'second', 'seconds')
 
 SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'space': ' '}

@@ -232,6 +232,8 @@ def test_exports_of_others(run, tmp_path, preset):
         ('vicon', 'Objects\n', 'Units in meters\n', 1e-3),  # the header says mm
         ('spatialanalyzer', '// Spatial', '// Units: Inches\n// Spatial', 0.0254),
         ('spatialanalyzer', '// Spatial', '// Length Units = m, Angle: deg\n// Spatial', 1.0),
+        ('spatialanalyzer', '// Spatial', '// Units are in cm\n// Spatial', 1e-2),
+        ('spatialanalyzer', '// Spatial', '// Robot unit in cell 4, power unit M 12\n//', 1e-3),
         ('optitrack', 'Millimeters', 'Meters', 1.0),
     ],
 )
