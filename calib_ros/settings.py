@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, TypeAlias, get_args
 
+from calib_ros.annotated import check_fields
 from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
 
 Criterion: TypeAlias = Literal['d', 'o2', 'o3', 'o4', 'o5', 'task']
@@ -171,6 +172,7 @@ class Settings:
         return chosen | {'priors': priors, 'effects': effects_of(self.model)}
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.mode not in MODES:
             raise UnknownNameError('mode', self.mode, MODES)
         for item in fields(self):

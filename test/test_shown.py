@@ -8,6 +8,7 @@ import pkgutil
 import re
 import sys
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,10 @@ SEEN = measure(CHAIN, JOINTS, np.random.default_rng(2), 1e-4, 1e-4)
 PROBLEM = calib_ros.Problem(CHAIN, SEEN)
 RESULT = calib_ros.identify(PROBLEM)
 ARM = calib_ros.Calibration.of(RESULT)
+DESIGN = Design.of(PROBLEM)
+PLANNED = {'candidates': JOINTS[:40], 'task': JOINTS[:5], 'count': 8, 'draws': 2}
+CORRECTED = calib_ros.Compensator(CHAIN, ARM.chain)
+NOT_NUMBERS = (JOINTS > 0.0, JOINTS + 1j, JOINTS.astype('datetime64[s]'), JOINTS.astype(str), 'a')
 VALUES = (CHAIN, SEEN, PROBLEM, RESULT, ARM, RESULT.posterior)
 
 
@@ -44,25 +49,106 @@ def test_a_value_fits_on_a_screen(value):
         (lambda: calib_ros.Problem(SEEN, CHAIN), 'chain must be of type Chain, not Observations'),
         (lambda: calib_ros.identify(CHAIN), 'problem must be of type Problem, not Chain'),
         (lambda: calib_ros.verify(RESULT, [SEEN], None), r'Calibration \(Calibration.of\(result'),
-        (lambda: calib_ros.verify(ARM, SEEN, None), 'sets must be a list of Observations'),
+        (
+            lambda: calib_ros.verify(ARM, SEEN, None),
+            r'sets must be of type Sequence\[Observations\]',
+        ),
         (lambda: calib_ros.difference(ARM, RESULT), 'second must be of type Calibration'),
         (lambda: calib_ros.Calibration.of(CHAIN), 'result must be of type Identification'),
         (lambda: calib_ros.Compensator(CHAIN, ARM), 'calibrated must be of type Chain, not Cal'),
-        (lambda: calib_ros.CalibrationSession('ur10e'), 'chain must be of type Chain, not str'),
+        (
+            lambda: calib_ros.CalibrationSession('ur10e'),
+            'chain must be of type Chain, not .ur10e',
+        ),
         (lambda: Design.of(RESULT), 'problem must be of type Problem, not Identification'),
         (lambda: calib_ros.recalibrate(ARM, RESULT, 1.0), 'problem must be of type Problem'),
-        (lambda: calib_ros.recalibrate(ARM, PROBLEM, 1.0, new='tool'), 'unknown frame "t"'),
+        (
+            lambda: calib_ros.recalibrate(ARM, PROBLEM, 1.0, new='tool'),
+            r'new must be of type Sequence\[str\]',
+        ),
         (
             lambda: calib_ros.corrected_urdf('<robot/>', ARM),
             'chain must be of type Chain, not Cal',
         ),
-        (lambda: calib_ros.chain_from_urdf(Path('a')), 'text must be of type str, not PosixPath'),
+        (lambda: calib_ros.chain_from_urdf(Path('a')), 'text must be of type str, not Pos'),
         (lambda: calib_ros.dump_chain(ARM), 'chain must be of type Chain, not Calibration'),
     ],
 )
 def test_arguments_of_another_type_are_named(call, said):
     with pytest.raises(calib_ros.CalibrationError, match=said):
         call()
+
+
+@pytest.mark.parametrize(
+    'call',
+    [
+        *(
+            partial(calib_ros.Problem, CHAIN, SEEN, **{name: value})
+            for name, value in [
+                *(('priors', wrong) for wrong in (None, [1], {'*.a': 'a'}, {'*.a': True})),
+                *(('fixed', wrong) for wrong in (None, 'tool.x', [1])),
+                *((name, [None]) for name in ('more', 'held_out', 'separations', 'effects')),
+                *(('largest_length', wrong) for wrong in (None, 'a', np.nan, True)),
+                ('largest_error', np.nan),
+                ('folds', 2.5),
+            ]
+        ),
+        *(
+            partial(calib_ros.Settings, **wrong)
+            for wrong in ({'folds': 2.5}, {'fixed': 'tool.x'}, {'sigma_pixel': 'a'})
+        ),
+        *(
+            partial(calib_ros.verify, ARM, **{'sets': [SEEN], 'tolerance': 1e-3, **wrong})
+            for wrong in ({'tolerance': 'a'}, {'tolerance': np.nan}, {'sets': [1]})
+        ),
+        *(
+            partial(calib_ros.plan, DESIGN, **{**PLANNED, **wrong})
+            for wrong in (
+                *({'candidates': each} for each in (*NOT_NUMBERS, JOINTS * np.nan, JOINTS[:0])),
+                *({'task': each} for each in (JOINTS * np.nan, JOINTS[:0], None)),
+                *({'velocities': each} for each in ([1.0], np.zeros(6), np.full(6, np.nan))),
+                *({'count': each} for each in (2.5, 'a', None)),
+                {'apart': np.nan},
+            )
+        ),
+        *(partial(calib_ros.compensate, CORRECTED, wrong) for wrong in NOT_NUMBERS),
+        *(partial(CHAIN.forward, wrong) for wrong in NOT_NUMBERS),
+        *(partial(calib_ros.Observations.touching, wrong) for wrong in (*NOT_NUMBERS, None)),
+        *(
+            partial(
+                calib_ros.Observations.from_pixels, JOINTS, JOINTS[:, :2], JOINTS[:, :3], wrong
+            )
+            for wrong in (None, JOINTS[:, 0])
+        ),
+        partial(Design.of, PROBLEM, PROBLEM),
+        partial(calib_ros.load_calibration, 3),
+        partial(calib_ros.load_chain, None),
+        partial(calib_ros.identify_model, PROBLEM, None),
+        partial(calib_ros.Calibration.of, RESULT, fitted=SEEN),
+        partial(calib_ros.recalibrate, ARM, PROBLEM, np.nan),
+        partial(calib_ros.Compensator, CHAIN, CHAIN, tool=None),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_an_error_of_ours(call):
+    with pytest.raises(calib_ros.CalibrationError):
+        call()
+
+
+def test_an_argument_that_is_missing_is_told_as_python_does():
+    with pytest.raises(TypeError, match=r'identify\(\) missing 1 required'):
+        calib_ros.identify()
+
+
+def test_lists_for_arrays_and_integers_for_numbers_are_taken():
+    found = calib_ros.plan(DESIGN, **PLANNED | {'candidates': JOINTS[:40].tolist(), 'apart': 0})
+    assert np.array_equal(found.joints, calib_ros.plan(DESIGN, **PLANNED | {'apart': 0}).joints)
+
+
+def test_a_problem_does_not_follow_a_list_that_changes():
+    fixed = ['elbow_joint.a']
+    problem = calib_ros.Problem(CHAIN, SEEN, fixed=fixed)
+    fixed.append('*')
+    assert problem.fixed == ('elbow_joint.a',)
 
 
 def test_a_result_is_a_data_frame():

@@ -21,6 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
+from calib_ros.annotated import as_annotated, check_fields
 from calib_ros.decision.region import Region
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
@@ -30,7 +31,6 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import EXACT, LEVER, TURN_IN_PART, Limits
 from calib_ros.shown import Shown
-from calib_ros.values import require
 
 BESIDE = LEVER / 3.0
 """Distance [m] from the tool at which the effect of a turn is reported: a small tool's length."""
@@ -51,10 +51,10 @@ class Compensator(Shown, Limits):
     """Where the calibration may be used; samples elsewhere are refused."""
 
     def __post_init__(self) -> None:
-        require(Chain, nominal=self.nominal, calibrated=self.calibrated)
+        check_fields(self)
         known = 'the nominal chain', self.nominal
         refuse_other_joints('the calibrated chain', self.calibrated, *known)
-        if len(self.tool) != 3 or not np.isfinite(self.tool).all():
+        if not np.isfinite(self.tool).all():
             raise ConfigError(f'tool must be three finite numbers [m], not {self.tool}')
         for name in (item.name for item in fields(Limits)):
             value = getattr(self, name)
@@ -100,6 +100,7 @@ class Compensation(Solution):
         return self.joints - self.command
 
 
+@as_annotated
 def compensate(
     compensator: Compensator,
     joints: FloatArray,
@@ -113,14 +114,9 @@ def compensate(
 
     Raises InputError for joint values of the wrong shape, or not finite.
     """
-    require(Compensator, compensator=compensator)
-    command = np.array(joints, dtype=np.float64)
-    count = len(compensator.nominal.joints)
-    if command.ndim != 2 or command.shape[1] != count or not len(command):
-        raise InputError(f'joint values must have the shape (N, {count}), not {command.shape}')
-    bad = np.flatnonzero(~np.isfinite(command).all(axis=1))
-    if bad.size:
-        raise InputError(f'joint values of point {bad[0]} are not all finite numbers')
+    command = compensator.nominal.joint_values(joints).copy()
+    if not len(command):
+        raise InputError('there are no joint values to correct')
     if approach is not None and np.shape(approach) != command.shape:
         raise InputError(f'approach must have the shape {command.shape} of the joint values')
     follower = compensator.follower

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg
 
+from calib_ros.annotated import as_annotated
 from calib_ros.decision.result import Identification
 from calib_ros.errors import InputError
 from calib_ros.estimation.identifiability import independent, structurally_independent
@@ -26,7 +27,6 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.sampling.live import Estimate
 from calib_ros.settings import LEVER
 from calib_ros.shown import Shown
-from calib_ros.values import require
 
 ASSUMED_TOOL = 3 * (LEVER / 3.0,)
 """Assumed place of an unknown target [m] in the flange frame: on its axis, where an identity frame
@@ -48,6 +48,7 @@ class Design(Shown):
     tool: str = 'tool'  # frames of the chain for further poses
 
     @classmethod
+    @as_annotated
     def of(cls, problem: Problem, result: Identification | Estimate | None = None) -> Design:
         """Return the design of a problem, with nothing known but the priors.
 
@@ -55,7 +56,6 @@ class Design(Shown):
         further poses have its noise. Measured values do not count otherwise: `simulation.measure`
         can make the observations of a problem before anything is measured. Distances are refused.
         """
-        require(Problem, problem=problem)
         kind = problem.kinds[0]
         if kind.distance or problem.separations:
             raise InputError('planning needs measured poses or positions, not distances')

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
+from calib_ros.annotated import as_annotated
 from calib_ros.apply.candidates import travel_times, visit_order
 from calib_ros.apply.design import Candidates, Design, accuracy, information_of, predicted, times
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
@@ -233,6 +234,7 @@ class Plan(Shown):
         return as_frame({'telling': self.visit + 1, **columns})
 
 
+@as_annotated
 def plan(
     design: Design,
     candidates: FloatArray,
@@ -252,24 +254,31 @@ def plan(
     two poses differ by at least `apart` [rad or m] in the joint that moves most. `chosen` (count,)
     are indices already found.
 
-    Raises ConfigError or InputError if the candidates do not suffice.
+    Raises InputError if the candidates do not suffice, ConfigError for a count below one or rates
+    that are not positive.
     """
+    candidates, task = map(design.chain.joint_values, (candidates, task))
+    if not len(candidates) or not len(task):
+        raise InputError('a plan needs candidates, and at least one pose of the task')
+    joints = candidates.shape[1]
+    speeds = np.ones(joints) if velocities is None else velocities
+    if speeds.shape != (joints,) or not (speeds > 0.0).all():
+        raise ConfigError(f'velocities must be {joints} positive numbers, not {speeds}')
     excited = design.determined_by(candidates)
     if chosen is None:
         chosen = choose(excited, candidates, count, criterion, task, apart, progress)
-    joints = candidates[chosen]
-    speeds = np.ones(joints.shape[1]) if velocities is None else velocities
-    visit = visit_order(joints, speeds)
+    found = candidates[chosen]
+    visit = visit_order(found, speeds)
     rng = np.random.default_rng(0)
     orders = [rng.permutation(len(candidates))[:count] for _ in range(draws)]
     at_random = [accuracy(excited, candidates[order], task) for order in orders]
-    predictions = accuracy(excited, joints, task)
+    predictions = accuracy(excited, found, task)
     bound = None
     if criterion in ('d', 'task') and np.isfinite(predictions[-1]):
         bound = efficiency(excited, candidates, chosen, task if criterion == 'task' else None)
-    moves = travel_times(joints[visit], speeds)
+    moves = travel_times(found[visit], speeds)
     return Plan(
-        joints,
+        found,
         visit,
         float(np.diagonal(moves, 1).sum()),
         predictions,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib_ros.annotated import check_fields
 from calib_ros.apply.compensation import (
     Compensation,
     Compensator,
@@ -41,6 +42,9 @@ class Program(Shown):
     approach: FloatArray | None = None
     """(N, n) signs of the velocities with which the arm's joints reach their values, for backlash.
     By default from the order of the positions."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def compensate_program(

@@ -28,6 +28,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from scipy.spatial import cKDTree
 
+from calib_ros.annotated import as_annotated
 from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
@@ -50,7 +51,7 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, Shown
-from calib_ros.values import SAME, require
+from calib_ros.values import SAME
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
 STANDS: dict[Verdict, Verdict] = {'PASS': 'holds', 'FAIL': 'does not hold'}
@@ -138,6 +139,7 @@ class Verification(Shown):
         )
 
 
+@as_annotated
 def verify(
     arm: Calibration,
     sets: Sequence[Observations],
@@ -216,8 +218,6 @@ def _compared(
     wanted, uncorrected = sets, False
     if commanded is not None:
         commanded = before.joint_values(commanded)
-        if not np.isfinite(commanded).all():
-            raise InputError('the commanded joint values are not all finite numbers')
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
         arms = arm.before, arm.chain
         found = [_meant(*arms, each.joints, commanded) for each in sets]
@@ -302,10 +302,9 @@ def _check(
     confidence: float,
     fitted: tuple[str, ...],
 ) -> None:
-    require(Calibration, arm=arm)
     chain = arm.chain
-    if isinstance(sets, Observations) or not sets:
-        raise ConfigError('sets must be a list of Observations, at least one')
+    if not sets:
+        raise ConfigError('sets must hold at least one set of Observations')
     if tolerance is not None and not 0.0 < tolerance < np.inf:
         raise ConfigError(f'tolerance must be positive and finite, not {tolerance} m')
     if not 0.5 < confidence < 1.0:

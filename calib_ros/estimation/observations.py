@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.annotated import as_annotated, check_fields
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import configurations, stops, successive
 from calib_ros.kinematics import se3
@@ -79,6 +80,7 @@ class Observations(Shown):
     """The distances are heights over the plane z = 0 of the world, zero where touched."""
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.plane and self.distances is None:
             raise InputError('a plane needs the heights over it as distances, zero where touched')
         if (self.pixels is None) != (self.points is None):
@@ -102,6 +104,7 @@ class Observations(Shown):
         return len(self.stamps_ns)
 
     @classmethod
+    @as_annotated
     def from_arrays(
         cls, joints: FloatArray, positions: FloatArray, rotations: FloatArray | None = None
     ) -> Observations:
@@ -112,12 +115,12 @@ class Observations(Shown):
         Raises InputError for arrays that are not numeric, have another shape, or are not
         rotations.
         """
-        joints, positions = _numbers('joints', joints), _numbers('positions', positions)
+        joints, positions = joints.copy(), positions.copy()
         if joints.ndim != 2:
             raise InputError(f'joints must have the shape (N, n), not {joints.shape}')
         count, oriented = len(joints), rotations is not None
-        if oriented:
-            turns = _numbers('rotations', rotations)
+        if rotations is not None:
+            turns = rotations.copy()
         else:
             turns = np.broadcast_to(np.eye(3), (count, 3, 3))
         stamps = np.arange(1, count + 1, dtype=np.int64) * 1_000_000_000
@@ -127,6 +130,7 @@ class Observations(Shown):
         return found
 
     @classmethod
+    @as_annotated
     def from_pixels(
         cls,
         joints: FloatArray,
@@ -141,16 +145,17 @@ class Observations(Shown):
         image.
         """
         plain = cls.from_arrays(joints, np.broadcast_to(np.zeros(3), (len(joints), 3)))
-        stamps = (np.asarray(images, dtype=np.int64) + 1) * 1_000_000_000
+        stamps = (images.astype(np.int64) + 1) * 1_000_000_000
         return replace(
             plain,
             stamps_ns=stamps,
-            pixels=np.asarray(pixels, dtype=np.float64),
-            points=np.asarray(points, dtype=np.float64),
+            pixels=pixels.copy(),
+            points=points.copy(),
             on_flange=on_flange,
         )
 
     @classmethod
+    @as_annotated
     def touching(cls, joints: FloatArray, base: str = 'base', tool: str = 'tool') -> Observations:
         """Make observations of a point touching one plane, at joint values (N, n)."""
         heights = np.zeros(len(joints))
@@ -270,17 +275,6 @@ class Observations(Shown):
     def stops(self) -> Index:
         """Return the stop number (N,) of each pair, in sequence."""
         return stops(self.joints)
-
-
-def _numbers(name: str, values: object) -> FloatArray:
-    """Return a copy of real numbers as an array, masked ones as NaN."""
-    try:
-        if (kind := np.asanyarray(values).dtype).kind not in 'iufO':
-            raise TypeError(f'they are {kind}')
-        array = np.ma.array(values, dtype=np.float64, copy=True)
-    except (TypeError, ValueError) as err:
-        raise InputError(f'{name} must be real numbers in an array: {err}') from err
-    return np.asarray(array.filled(np.nan)) if np.ma.is_masked(array) else np.asarray(array.data)
 
 
 def _refuse_other_than_rotations(turns: FloatArray) -> None:

@@ -8,10 +8,10 @@ import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from numbers import Integral, Real
 
 import numpy as np
 
+from calib_ros.annotated import check_fields
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import SCATTER
@@ -26,7 +26,6 @@ from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS, LENS_KINDS, Param
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.settings import Settings
 from calib_ros.shown import Shown
-from calib_ros.values import require
 
 NOISE_FIELDS = ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch')
 TOOL = 1.0  # largest length [m] of a target on a flange, assumed
@@ -92,21 +91,15 @@ class Problem(Shown):
     """True if the samples were messages, to which table options do not apply."""
 
     def __post_init__(self) -> None:
-        require(Chain, chain=self.chain)
-        require(Observations, observations=self.observations)
+        check_fields(self)
         priors = {f'the prior of {pattern}': sigma for pattern, sigma in self.priors.items()}
         for name, sigma in (self.sigmas | priors).items():
-            if not isinstance(sigma, Real) or not 0.0 < float(sigma) < np.inf:
+            if not 0.0 < sigma < np.inf:
                 raise ConfigError(f'{name} must be a positive number, not {sigma}')
-        if not isinstance(self.sigma_scale, Real) or not 0.0 <= float(self.sigma_scale) < 1.0:
+        if not 0.0 <= self.sigma_scale < 1.0:
             raise ConfigError(f'sigma_scale must be from 0 to 1, not {self.sigma_scale}')
-        if not isinstance(self.folds, Integral) or self.folds < 2:
+        if self.folds < 2:
             raise ConfigError(f'folds must be an integer of at least 2, not {self.folds}')
-        for name in ('fixed', 'effects'):
-            if isinstance(getattr(self, name), str):
-                raise ConfigError(f'{name} must be a list of names, not "{getattr(self, name)}"')
-        if isinstance(self.more, Observations):
-            raise ConfigError('more must be a list of observations, not one of them')
         if self.loss not in LOSSES:
             raise UnknownNameError('loss', self.loss, LOSSES)
         self._check_sets()

@@ -11,6 +11,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from calib_ros.annotated import as_annotated
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.errors import InputError, UnknownNameError, shortened
 from calib_ros.files import stored
@@ -57,6 +58,7 @@ class Replayed:
         return (*unreadable, *too_much_lost(account, largest_loss))
 
 
+@as_annotated
 def replay(path: Path | str, session: CalibrationSession, progress: Notify = quiet) -> Replayed:
     """Feed a bag to a session; return what could be read.
 

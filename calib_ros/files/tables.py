@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calib_ros.annotated import as_annotated
 from calib_ros.errors import ColumnsError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import Codes, Columns, columns_of, measured
@@ -39,6 +40,7 @@ from calib_ros.texts import LARGEST_TABLE, read_bytes
 USUAL_SIGMAS = Settings().sigmas
 
 
+@as_annotated
 def read_table(
     path: Path | str,
     joints: int,

@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 import calib_ros
+from calib_ros.annotated import as_annotated
 from calib_ros.decision.region import Region, packed, region_of_record, rows_of
 from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import Step, find_step
@@ -52,7 +53,6 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import MODELS, Model, Settings
 from calib_ros.shown import Shown
-from calib_ros.values import require
 
 HEAD = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
 
@@ -87,6 +87,7 @@ class Calibration(Shown):
     """Of the fitted measurements."""
 
     @classmethod
+    @as_annotated
     def of(
         cls,
         result: Identification,
@@ -98,7 +99,6 @@ class Calibration(Shown):
 
         `verify` recognises the `fitted` ones, and cannot pass on them.
         """
-        require(Identification, result=result)
         before, after = (result.validation or result.fitted).figures
         region, noise, owners = result.region, result.noise, owners or {}
         rms_mm = round(after.rms_mm, 6)  # as in the file
@@ -306,6 +306,7 @@ def calibration_file(path: str | os.PathLike[str]) -> Path:
     return file / 'calibration.yaml' if file.is_dir() else file
 
 
+@as_annotated
 def load_calibration(path: str | os.PathLike[str], nominal: Chain | None = None) -> Calibration:
     """Read a calibration from its file or an identification's folder (`parse_calibration`)."""
     file = calibration_file(path)

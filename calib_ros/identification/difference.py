@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from calib_ros.annotated import as_annotated
 from calib_ros.decision import changes
 from calib_ros.decision.changes import Effects, Explanation, Information
 from calib_ros.decision.drift import inverse_root
@@ -41,7 +42,6 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.shown import Shown
-from calib_ros.values import require
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -119,12 +119,12 @@ def _rows_in_words(chain: Chain) -> str:
     return f'{", ".join(rows)} ({chain.convention})'
 
 
+@as_annotated
 def difference(first: Calibration, second: Calibration) -> Difference:
     """Compare two calibrations of one robot.
 
     Raises InputError if they have different joints, or no covariance.
     """
-    require(Calibration, first=first, second=second)
     arms = first.chain, second.chain
     ours, theirs = map(_rows_in_words, arms)
     if ours != theirs:

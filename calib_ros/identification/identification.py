@@ -17,6 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib_ros.annotated import as_annotated
 from calib_ros.decision import mistakes, plausibility
 from calib_ros.decision.acceptance import oddities, refusals
 from calib_ros.decision.comparison import GroupVerdict, compare
@@ -43,9 +44,9 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Notify, quiet, share_of
 from calib_ros.settings import EXCEPTION, effects_of
-from calib_ros.values import require
 
 
+@as_annotated
 @np.errstate(divide='ignore', over='ignore', invalid='ignore')  # of a diverging fit
 def identify(
     problem: Problem, simpler: Identification | None = None, progress: Notify = quiet
@@ -58,7 +59,6 @@ def identify(
     Raises TooFewObservationsError with fewer equations than parameters. Raises InputError if the
     fit diverges; the message names the mistake that explains it, if any.
     """
-    require(Problem, problem=problem)
     try:
         return _identified(problem, simpler, progress)
     except np.linalg.LinAlgError as err:
@@ -204,6 +204,7 @@ def _gauges(fitted: Fitted) -> dict[str, list[str]]:
     return identifiability.trades(normal.matrix, free, names)
 
 
+@as_annotated
 def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Identification:
     """Identify with the errors named by `model`; `auto` chooses them by cross-validation.
 
@@ -211,7 +212,6 @@ def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Id
     geometric result is returned with the verdicts and a remark. An exception from `progress` ends
     the work. Raises UnknownNameError for another model.
     """
-    require(Problem, problem=problem)
     progress(f'model {"geometric" if model == "auto" else model}')
     if model != 'auto':
         return identify(replace(problem, effects=effects_of(model)), progress=progress)

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from calib_ros.annotated import as_annotated
 from calib_ros.decision import changes, mistakes
 from calib_ros.decision.changes import SCALE_OF_DEVICE, Effects, Explanation, Information, root_of
 from calib_ros.decision.comparison import Comparison, compare, residuals
@@ -46,7 +47,6 @@ from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import GROWTH
 from calib_ros.shown import rows_in_words
-from calib_ros.values import require
 
 
 def years_since(record: Mapping[str, Any]) -> float:
@@ -58,6 +58,7 @@ def years_since(record: Mapping[str, Any]) -> float:
     return max(0.0, age.days / 365.25)
 
 
+@as_annotated
 def recalibrate(
     previous: Calibration,
     problem: Problem,
@@ -72,8 +73,6 @@ def recalibrate(
     of angles twice that [rad]. `new` are frames of moved devices and of remounted targets. Raises
     InputError if the calibration has no covariance or lacks a frame, or for a mistake.
     """
-    require(Calibration, previous=previous)
-    require(Problem, problem=problem)
     if mistake := mistakes.explained(problem, far=True):
         raise InputError(f'the new poses do not fit the arm: {mistake}')
     try:

@@ -31,7 +31,7 @@ from typing import Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 
-from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
+from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.joint import (
     ANYWHERE,
@@ -51,6 +51,7 @@ from calib_ros.kinematics.parameter import (
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.walk import Walk
 from calib_ros.shown import Shown
+from calib_ros.values import array_of
 
 Convention: TypeAlias = Literal['standard', 'modified']
 
@@ -299,9 +300,9 @@ class Chain(Shown):
 
     def joint_values(self, q: FloatArray) -> FloatArray:
         """Return joint values (N, n) as an array; refuse any other shape."""
-        q = np.asarray(q, dtype=np.float64)
+        q = array_of(q, np.float64, 'joint values')
         if q.ndim != 2 or q.shape[1] != len(self.joints):
-            raise ConfigError(
+            raise InputError(
                 f'joint values must have the shape (N, {len(self.joints)}) for chain '
                 f'"{self.name}", not {q.shape}'
             )

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from calib_ros import texts
+from calib_ros.annotated import as_annotated
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
@@ -37,7 +38,6 @@ from calib_ros.values import (
     parse_name,
     parse_number,
     parse_numbers,
-    require,
 )
 
 CHAIN_KEYS = (
@@ -51,6 +51,7 @@ TWO_TURNS = 4.0 * math.pi
 URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
 
 
+@as_annotated
 def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
     """Read a chain file, a URDF, or a supplied robot by name, such as "ur10e".
 
@@ -246,12 +247,12 @@ def _frame_document(frame: Frame) -> dict[str, Any]:
     return document
 
 
+@as_annotated
 def dump_chain(chain: Chain, calibration: Mapping[str, Any] | None = None) -> str:
     """Return the text of a chain file; `calibration` is the origin of its numbers.
 
     The hash of its table ends it: a file that was cut off has none.
     """
-    require(Chain, chain=chain)
     document = chain_document(chain)
     if calibration is not None:
         ordered = sorted(calibration.items(), key=lambda each: each[0] == 'table_sha256')

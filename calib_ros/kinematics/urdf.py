@@ -25,6 +25,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib_ros.annotated import as_annotated
 from calib_ros.errors import ConfigError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import (
@@ -40,12 +41,13 @@ from calib_ros.kinematics.chain import (
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, edited, parse_urdf
 from calib_ros.settings import Settings
-from calib_ros.values import MOST_NAMES, SAME, require
+from calib_ros.values import MOST_NAMES, SAME
 
 MOST_APART = 2.0 * Settings.largest_angle
 """Mean pose difference [m or rad] at which a chain is not the arm of a URDF."""
 
 
+@as_annotated
 def chain_from_urdf(
     text: str,
     base_link: str | None = None,
@@ -65,7 +67,6 @@ def chain_from_urdf(
 
     Raises ConfigError if the text is not a URDF, or no serial chain connects the links.
     """
-    require(str, text=text)
     robot = parse_urdf(text)
     path = robot.path(base_link, tip_link)
     poses = robot.poses(path[0].parent)
@@ -101,6 +102,7 @@ def chain_from_urdf(
     )
 
 
+@as_annotated
 def corrected_urdf(
     text: str, chain: Chain, base_link: str | None = None, tip_link: str | None = None
 ) -> str:
@@ -117,7 +119,6 @@ def corrected_urdf(
     Raises ConfigError if the chain is not of this arm, or has effects beyond these couplings,
     which a URDF cannot represent.
     """
-    require(Chain, chain=chain)
     nominal = chain_from_urdf(text, base_link, tip_link, chain.convention)
     arm = replace(chain, base=nominal.base, tool=nominal.tool, frames=())
     _refuse_others(arm, nominal)

@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 
+from calib_ros.annotated import as_annotated
 from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.decision.result import Identification
 from calib_ros.errors import InputError, TooFewObservationsError
@@ -32,7 +33,6 @@ from calib_ros.sampling.sample import Frames, Sample, named, socket_place
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Part
 from calib_ros.settings import Settings
 from calib_ros.shown import some
-from calib_ros.values import require
 
 NOT_RECORDING = 'not recording: call ~/record with true'
 ONE_FRAME = 'only one may be used: set frame_id (--frame-id), or give each source its own device'
@@ -45,6 +45,7 @@ class CalibrationSession:
     requests raise InputError, impossible settings ConfigError.
     """
 
+    @as_annotated
     def __init__(
         self,
         chain: Chain,
@@ -52,7 +53,6 @@ class CalibrationSession:
         on_sample: Callable[[Sample], None] | None = None,
         on_removed: Callable[[Sample], None] | None = None,
     ) -> None:
-        require(Chain, chain=chain)
         self.chain = chain
         self.settings = settings or Settings()
         self.pictures = Pictures(lambda: self.settings.sigma_pixel)

@@ -108,13 +108,13 @@ def test_a_correction_that_did_not_arrive_shows(cell, arm, program):
     moved[3, 5] += 0.3
     with pytest.raises(InputError, match=r'measurement 10 was taken 0\.[23]\d* rad or m from'):
         verify(arm, [measured(true, moved)], 1e-3, commanded=meant)
-    with pytest.raises(ConfigError, match=r'must have the shape \(N, 6\)'):
+    with pytest.raises(InputError, match=r'must have the shape \(N, 6\)'):
         verify(arm, seen, 5e-4, commanded=meant[:, :5])
-    with pytest.raises(InputError, match='not all finite'):
+    with pytest.raises(InputError, match='NaN or infinite'):
         verify(arm, seen, 5e-4, commanded=meant * np.nan)
     again = verify(arm, seen, 5e-4, commanded=meant.tolist())
     assert again.verdict == verify(arm, seen, 5e-4, commanded=meant).verdict
-    with pytest.raises(ConfigError, match=r'must have the shape \(N, 6\)'):
+    with pytest.raises(InputError, match=r'must have the shape \(N, 6\)'):
         verify(arm, [replace(seen[0], joints=seen[0].joints[:, :5])], 5e-4)
 
 
@@ -358,7 +358,7 @@ def test_what_cannot_be_verified_is_refused(cell, arm):
     joints = UR.random_joints(6, np.random.default_rng(0))
     seen = measured(true, joints)
     for tolerance in (0.0, np.nan, np.inf):
-        with pytest.raises(ConfigError, match=f'tolerance must be positive .* not {tolerance} m'):
+        with pytest.raises(ConfigError, match=f'tolerance must be .* not {tolerance}'):
             verify(arm, [seen], tolerance, 0.95)
     for confidence in (0.4, 1.0, 95.0):
         with pytest.raises(

@@ -45,15 +45,16 @@ MASKED = np.ma.masked_array(THREE, mask=[[0, 0, 0], [0, 1, 0], [0, 0, 0]])
         ((SIX, THREE, np.zeros((3, 4))), 'rotations of 3 observations'),
         *(((SIX + bad, THREE), 'joints .* NaN or infinite') for bad in (np.nan, np.inf)),
         *(((SIX, THREE + bad), 'positions .* NaN or infinite') for bad in (np.nan, np.inf)),
-        ((SIX, MASKED), 'positions of the observations hold NaN'),
+        ((None, None), 'joints must be real numbers'),
+        ((SIX, MASKED), 'positions .* NaN'),
         (([['a'] * 6], [[0.0] * 3]), 'joints must be real numbers'),
         *(
-            ((SIX, THREE.astype(kind)), f'real numbers in an array: they are {kind}')
+            ((SIX, THREE.astype(kind)), f'real numbers in an array, not {kind}')
             for kind in ('bool', 'complex128', 'datetime64', '<U3')
         ),
         *(
             (arrays, r'joints must have the shape \(N, n\)')
-            for arrays in ((None, None), (1.0, 2.0), ([0.0] * 6, [0.0] * 3), ([], []))
+            for arrays in ((1.0, 2.0), ([0.0] * 6, [0.0] * 3), ([], []))
         ),
         *(
             ((SIX, THREE, np.stack([np.eye(3), turn, np.eye(3)])), f'pair 1 .* {words}')

@@ -1,0 +1,100 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of the arguments of public functions, and of fields, by their annotations."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import typing
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from functools import cache, wraps
+from numbers import Integral, Real
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
+
+_F = TypeVar('_F', bound=Callable[..., Any])
+_FLAGS = ('bool', 'bool_')  # of Python, and of both generations of numpy
+_QUOTED = (str, Real, NoneType, tuple, list)
+_TESTS: dict[Any, Callable[[Any], bool]] = {
+    bool: lambda x: type(x).__name__ in _FLAGS,
+    float: lambda x: isinstance(x, Real) and type(x).__name__ not in _FLAGS and x == x,
+    Any: lambda x: True,
+    int: lambda x: isinstance(x, Integral) and type(x).__name__ not in _FLAGS,
+}
+_hints: Callable[[Any], dict[str, Any]] = cache(typing.get_type_hints)
+
+
+def as_annotated(function: _F) -> _F:
+    """Make a function refuse arguments that are not as annotated.
+
+    Sequences arrive as tuples, arrays as `array_of` returns them, without NaN.
+    """
+    taken = inspect.signature(function)
+
+    @wraps(function)
+    def call(*args: Any, **named: Any) -> Any:
+        try:
+            given, hints = taken.bind(*args, **named), _hints(function)
+        except TypeError:
+            return function(*args, **named)  # whose error names it
+        for name, value in given.arguments.items():
+            given.arguments[name] = _fitting(value, hints.get(name, Any), name, True)
+        return function(*given.args, **given.kwargs)
+
+    return typing.cast(_F, call)
+
+
+def check_fields(made: Any) -> None:
+    """Refuse fields of a dataclass that are not as annotated; arrays may have NaN."""
+    hints = _hints(type(made))
+    for name in made.__dataclass_fields__:
+        value = getattr(made, name)
+        if (found := _fitting(value, hints[name], name, False)) is not value:
+            object.__setattr__(made, name, found)
+
+
+def _fitting(value: Any, hint: Any, name: str, finite: bool) -> Any:
+    """Return a value as annotated; the ConfigError or InputError for another one has its name."""
+    kind, parts = get_origin(hint) or hint, get_args(hint)
+    if kind in (typing.Union, UnionType):
+        if len(parts) == 2 and value is not None and parts[1] is NoneType:
+            return _fitting(value, parts[0], name, finite)
+        for each in parts:
+            with suppress(CalibrationError):
+                return _fitting(value, each, name, finite)
+    elif kind is Literal and isinstance(value, str):
+        if value in parts:
+            return value
+        raise UnknownNameError(name, value, parts)
+    elif getattr(kind, '__name__', '') == 'ndarray':
+        from calib_ros.values import array_of  # loads numpy, not needed by --help
+
+        return array_of(value, get_args(parts[1])[0], name, finite)
+    elif kind is Mapping and isinstance(value, Mapping):
+        return {
+            _fitting(key, parts[0], f'a key of {name}', finite): _fitting(
+                each, parts[1], f'{name}[{key!r}]', finite
+            )
+            for key, each in value.items()
+        }
+    elif kind in (tuple, Sequence) and _is_list(value):
+        items, several = tuple(value), kind is Sequence or parts[-1] is Ellipsis
+        hints = parts[:1] * len(items) if several else parts
+        if len(hints) == len(items):
+            pairs = enumerate(zip(items, hints, strict=True))
+            return tuple(_fitting(x, of, f'{name}[{k}]', finite) for k, (x, of) in pairs)
+    elif kind is not Sequence and _TESTS.get(kind, lambda x: isinstance(x, kind))(value):
+        return value
+    wanted = re.sub(r'(\w+\.)+(?=\w)', '', inspect.formatannotation(hint))
+    made = ' (Calibration.of(result))' if wanted == 'Calibration' else ''
+    shown = f'{value!r:.60}' if isinstance(value, _QUOTED) else type(value).__name__
+    raise ConfigError(f'{name} must be of type {wanted}{made}, not {shown}')
+
+
+def _is_list(value: object) -> bool:
+    text = isinstance(value, str | bytes | Mapping)
+    return isinstance(value, Collection) and not text and getattr(value, 'ndim', 1) > 0
