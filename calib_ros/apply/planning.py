@@ -26,10 +26,18 @@ from scipy import linalg
 
 from calib_ros.annotated import as_annotated
 from calib_ros.apply.candidates import travel_times, visit_order
-from calib_ros.apply.design import Candidates, Design, accuracy, information_of, predicted, times
+from calib_ros.apply.design import (
+    Candidates,
+    Design,
+    accuracy,
+    information_of,
+    predicted,
+    times,
+    triangular,
+)
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation.configurations import STILL
-from calib_ros.estimation.identifiability import indices_of
+from calib_ros.estimation.identifiability import independent, indices_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import CRITERIA, Criterion
@@ -224,6 +232,8 @@ class Plan(Shown):
     too few poses to determine all parameters."""
     lacking: tuple[str, ...]
     """Parameters that no choice of these candidates would determine; they are ignored."""
+    least: int = 1
+    """With fewer poses some parameter is certainly undetermined: each has so many rows."""
 
     def to_frame(self) -> Any:
         """Return the joint values [rad or m] in visiting order as a pandas.DataFrame.
@@ -273,6 +283,8 @@ def plan(
     orders = [rng.permutation(len(candidates))[:count] for _ in range(draws)]
     at_random = [accuracy(excited, candidates[order], task) for order in orders]
     predictions = accuracy(excited, found, task)
+    known = independent(triangular(excited.known), excited.names)
+    unknown = len(excited.names) - len(known)
     bound = None
     if criterion in ('d', 'task') and np.isfinite(predictions[-1]):
         bound = efficiency(excited, candidates, chosen, task if criterion == 'task' else None)
@@ -285,6 +297,7 @@ def plan(
         np.median(at_random, axis=0),
         bound,
         tuple(name for name in design.names if name not in excited.names),
+        -(-unknown // excited.rows(candidates[:1]).shape[1]),
     )
 
 
@@ -347,7 +360,8 @@ def accuracy_in_words(plan: Plan) -> list[str]:
         by_chance = f'{random:8.4f}' if np.isfinite(random) else '       -'
         lines.append(f'{number:6} {planned:9.4f} {by_chance}')
     if not first:
-        lines.append(f'{count:6}         - too few poses to determine all parameters')
+        why = f'too few poses to determine all parameters: at least {plan.least} are needed'
+        lines.append(f'{count:6}         - {why}')
     return lines
 
 

@@ -136,7 +136,7 @@ def test_plan_tells_how_many_poses_are_tried_and_exchanged(monkeypatch, run):
 def test_plan_with_too_few_poses_says_so(run, tmp_path):
     few = ('plan', '--chain', 'ur10e', '--poses', 3, '--draw', 200, '--out', 'plan.csv')
     _, out, _ = run(*few)
-    assert 'too few poses to determine all parameters' in out
+    assert 'too few poses to determine all parameters: at least 5 are needed' in out
     page = (tmp_path / 'plan.report.html').read_text()
     assert 'Plan again with more poses' in page
     assert 'Drive to each pose' not in page

@@ -205,3 +205,14 @@ def test_the_way_is_close_to_the_shortest(count, seed):
         changed[i:j] = order[i:j][::-1]
         assert travel(q, changed, speeds) >= travel(q, order, speeds) - 1e-6
         changed[i:j] = order[i:j]
+
+
+@pytest.mark.parametrize(('oriented', 'least'), [(True, 5), (False, 9)])
+def test_a_plan_tells_the_fewest_poses_that_determine_all(oriented, least):
+    """A pose of 6 rows or 3, for 30 parameters or 27."""
+    chain = arm()
+    design, poses = design_of(chain, oriented), some(chain, 200)
+    for count in (least - 1, least):
+        found = planning.plan(design, poses, poses[:20], count, draws=1)
+        assert found.least == least
+        assert np.isfinite(found.accuracy[-1]) == (count == least)
