@@ -2,18 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables that others have written."""
 
-import re
-import sys
-import zipfile
-
 import numpy as np
 import pytest
 from robots import DATA, needs_data
 from scipy.spatial.transform import Rotation
 
 from calib_ros import load_chain, read_table
-from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
-from calib_ros.files import sheets
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, layout_of, load_layout
 
@@ -340,84 +335,10 @@ def test_a_table_without_joint_values_is_refused(run, tmp_path, names, proposed)
     assert f'cell.csv has no joint values: name their columns (--columns "{proposed}' in err
 
 
-@pytest.mark.parametrize('mark', ['# ', '// ', '//', '% '])
-def test_a_header_may_look_like_a_comment(read, mark):
-    assert_same(read(mark + PLAIN), None)
-
-
 def test_axes_called_like_accelerations_are_none(run, tmp_path):
     (tmp_path / 'cell.csv').write_text(PLAIN.replace('q', 'A'))
     assert run('import', 'cell.csv', '--columns', 'q*=A*', '--out', 'out.csv')[0] == 0
     assert (tmp_path / 'out.csv').read_text().splitlines()[0] == 'q1,q2,x,y,z'
-
-
-def test_workbooks(tmp_path, monkeypatch):
-    openpyxl = pytest.importorskip('openpyxl')
-    book = openpyxl.Workbook()
-    book.active.title = 'first'
-    sheet = book.create_sheet('measured')
-    for row in (
-        ['a title'],
-        NAMES,
-        ['rad', 'rad', 'm', 'm', 'm'],
-        *np.column_stack([JOINTS, PLACES]).tolist(),
-    ):
-        sheet.append(row)
-    path = tmp_path / 'cell.xlsx'
-    book.save(path)
-    assert_same(read_table(path, 2, foreign=Foreign(Layout(sheet='measured'))), None)
-    with pytest.raises(InputError, match='no sheet "other"; it has first, measured'):
-        read_table(path, 2, foreign=Foreign(Layout(sheet='other')))
-    other = book.create_sheet('later')
-    other.append(NAMES)
-    book['first'].sheet_state = 'hidden'
-    book.save(path)
-    found = read_table(path, 2, foreign=Foreign(Layout()))
-    assert_same(found, None)
-    assert 'there are no numbers in line 3: only units are read' in str(found.warnings)
-    assert 'sheet "measured" of 2 is read (--sheet)' in str(found.warnings)
-    book['first'].sheet_state = 'visible'
-    book['first'].append(['a protocol', 1])
-    points, log = book.create_sheet('points'), book.create_sheet('log')
-    for row in (['X [mm]', 'Y (mm)', 'Z / mm'], *(1e3 * PLACES).tolist()):
-        points.append(row)
-    for row in (['J1', 'J2'], ['deg', '°'], *np.rad2deg(JOINTS).tolist()):
-        log.append(row)
-    book.save(path)
-    assert_same(read_table(path, 2, foreign=Foreign(Layout())), None)
-    of_joints = Layout(columns={'q1': 'J1', 'q2': 'J2'})
-    apart = Foreign(Layout(sheet='points'), None, path, of_joints)
-    assert_same(read_table(path, 2, foreign=apart), None)
-    del book['points'], book['log']
-    book['first'].sheet_state = 'hidden'
-    book.save(path)
-    smaller = zipfile.ZipFile(tmp_path / 'smaller.xlsx', 'w')
-    with zipfile.ZipFile(path) as whole, smaller:
-        for name in whole.namelist():
-            text = re.sub(rb'<dimension ref="[^"]*"', b'<dimension ref="A1:E3"', whole.read(name))
-            smaller.writestr(name, text)
-    assert_same(read_table(tmp_path / 'smaller.xlsx', 2, foreign=Foreign(Layout())), None)
-    path.write_bytes(b'no workbook')
-    with pytest.raises(InputError, match='no workbook, or damaged: save it as'):
-        read_table(path, 2, foreign=Foreign(Layout()))
-    columns = {'eye_in_hand': 'e'} | {f'q{k}': f'q{k}' for k in (1, 2)}
-    for rows, said in (
-        ([], 'has no rows'),
-        ([['q'] * (MOST_ENTRIES + 1)], f'has {MOST_ENTRIES + 1} columns, more than'),
-        ([[*NAMES, 'e'], [1, 2, 3, 4, 5, True]], 'of a camera on the flange need an orientation'),
-    ):
-        book = openpyxl.Workbook()
-        for row in rows:
-            book.active.append(row)
-        book.save(path)
-        with pytest.raises(InputError, match=said):
-            read_table(path, 2, foreign=Foreign(Layout(columns=columns)))
-    monkeypatch.setattr(sheets, 'LARGEST_SHEET', 100)
-    with pytest.raises(InputError, match='MB when unpacked'):
-        read_table(path, 2, foreign=Foreign(Layout()))
-    monkeypatch.setitem(sys.modules, 'openpyxl', None)
-    with pytest.raises(InputError, match=r'needs openpyxl: pip install "calib_ros\[xlsx\]"'):
-        read_table(path, 2, foreign=Foreign(Layout()))
 
 
 def test_columns_of_joints_are_those_of_their_log(run, tmp_path):

@@ -45,12 +45,10 @@ def test_errors_are_answers(cell, recording):
     cell.play(
         {'joint_states': some['joint_states'][:120], 'measured_pose': some['measured_pose'][:8]}
     )
-    few = 'too few different poses: 2 measured, at least 5'
-    assert few in cell.refused('identify').message
+    assert 'too few different poses: 2 measured, at least 5' in cell.refused('identify').message
 
 
 def test_clocks_that_disagree_are_to_be_set_first(cell, recording):
-    """The answer said to check the chain, and the status to synchronise the clocks."""
     session, (joints, poses) = cell.node.session, topics(recording).values()
     come = sorted([*joints, *poses], key=stamp_ns)  # as they arrive, whatever their stamps
     for message in poses:
