@@ -19,7 +19,7 @@ from calib_ros.decision.region import (
     region_of_record,
     unpacked_matrix,
 )
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
@@ -103,9 +103,9 @@ def test_an_arm_measured_everywhere_may_be_used_everywhere(seed):
     assert found.region.covers(UR10E.random_joints(50, np.random.default_rng(1))).all()
     q = UR10E.random_joints(7, np.random.default_rng(1))
     for wrong in (q[0], q[:, :5], q.T):  # one answer a row, or none
-        with pytest.raises(ConfigError, match=r'must have the shape \(N, 6\)'):
+        with pytest.raises(InputError, match=r'must have the shape \(N, 6\)'):
             found.region.covers(wrong)
-        with pytest.raises(ConfigError, match=r'must have the shape \(N, 6\)'):
+        with pytest.raises(InputError, match=r'must have the shape \(N, 6\)'):
             found.pose_covariance(wrong)
     for level in (0.0, 1.0, 95):
         with pytest.raises(ConfigError, match='level must be between 0 and 1'):
