@@ -29,7 +29,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision import mistakes, suspects
+from calib_ros.decision import mistakes, suspects, undoing
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.tables import read_table
 from calib_ros.kinematics import se3
@@ -179,7 +179,7 @@ def spoilt(problem):
         ('degrees read as radians', 'orientations do', rewritten('ZYX', 'ZYX', size=180 / np.pi)),
     ):
         yield group, words, with_(change, measured and oriented)
-    yield 'left-handed', 'left-handed', with_(suspects._mirrored, measured)
+    yield 'left-handed', 'left-handed', with_(undoing.mirrored, measured)
     for k in range(count):
         signs = np.ones(count)
         signs[k] = -1.0

@@ -17,8 +17,9 @@ from itertools import permutations, product
 
 import numpy as np
 
-from calib_ros.decision.suspects import Sets, Suspect, rows_away
+from calib_ros.decision.suspects import rows_away
 from calib_ros.decision.trials import in_frames, misses
+from calib_ros.decision.undoing import Sets, Suspect
 from calib_ros.estimation.levels import LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem

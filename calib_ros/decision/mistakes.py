@@ -26,8 +26,9 @@ import numpy as np
 from calib_ros.decision.lost_rows import dead, in_any_order, repeating, row_loss
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
-from calib_ros.decision.suspects import FIRST, ORIENTATIONS, Sets, Suspect, hidden, suspects
+from calib_ros.decision.suspects import FIRST, ORIENTATIONS, hidden, suspects
 from calib_ros.decision.trials import Bare, Trial, in_frames, misses, refined, trial_of
+from calib_ros.decision.undoing import Sets, Suspect
 from calib_ros.estimation.levels import (
     ALIKE,
     CLEARLY,

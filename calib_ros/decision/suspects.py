@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import combinations, permutations, product
 from typing import TypeAlias
@@ -13,17 +13,26 @@ from typing import TypeAlias
 import numpy as np
 
 from calib_ros.decision.printed_board import size_of
-from calib_ros.decision.rotation_conventions import Turn, misread
+from calib_ros.decision.rotation_conventions import misread
+from calib_ros.decision.undoing import (
+    DataChange,
+    Sets,
+    Suspect,
+    in_axes,
+    joints_by,
+    lengths,
+    mirrored,
+    of_kind,
+    scaled,
+    with_turn,
+)
 from calib_ros.estimation.levels import NEARER
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention
 from calib_ros.kinematics.chain_file import shipped_chains
-from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import counted
 
-Sets: TypeAlias = tuple[Observations, ...]
-DataChange: TypeAlias = Callable[[Observations], Observations]
 Rescaled: TypeAlias = Callable[[float], DataChange]
 QUARTERS = {'+90': 0.5 * np.pi, '-90': -0.5 * np.pi, '+180': np.pi}
 """Zeros of joints [rad] that differ between conventions."""
@@ -36,32 +45,6 @@ SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
 FIRST = ('measured', 'handed', 'order')
 """Parts whose mistakes are undone before those of single joints."""
 NOT_ON_FLANGE = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
-
-
-@dataclass(frozen=True, eq=False)
-class Suspect:
-    """A possible mistake, in words, and the option to give with a table.
-
-    `changes` in order undo it in the samples, `chain` is the corrected nominal one, joint values
-    are `rows` below their measurement. Of equivalent mistakes, those of lowest `rank` are named;
-    with 0 the other rows may do. `published` is the remedy for messages, live or from a bag.
-    Mistakes of different parts (those of FIRST, or a joint) may occur together.
-    """
-
-    what: str
-    remedy: str
-    changes: tuple[DataChange, ...] = ()
-    rank: int = 1
-    chain: Chain | None = None
-    rows: int = 0
-    published: str = 'correct the publisher and measure again (after ~/clear)'
-    part: str = ''
-
-    def undone(self, sets: Sets) -> Sets:
-        """Return the corrected samples."""
-        for change in self.changes:
-            sets = tuple(map(change, sets))
-        return sets
 
 
 ORIENTATIONS = Suspect(
@@ -92,7 +75,7 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
             yield from _misread(chain, seen)
         remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
         what = 'the axes of the measuring device are left-handed'
-        yield Suspect(what, remedy, (_mirrored,), 3, part='handed')
+        yield Suspect(what, remedy, (mirrored,), 3, part='handed')
     yield from _of_places(chain)
 
 
@@ -100,9 +83,9 @@ def _of_places(chain: Chain) -> Iterator[Suspect]:
     """Yield mistakes of joint values and the arm."""
     for one, other, unit, size in MIXED_UP_UNITS:
         what = f'the joint values are in {one}, not {other}'
-        change = _of_kind(chain, 'revolute', size)
+        change = of_kind(chain, 'revolute', size)
         yield Suspect(what, f'--joint-angle {unit}', (change,), part='measured')
-    yield from _of_lengths('linear joints', _linear(chain), partial(_of_kind, chain, 'prismatic'))
+    yield from _of_lengths('linear joints', _linear(chain), partial(of_kind, chain, 'prismatic'))
     yield from _of_joints(chain)
     yield from _of_one_unit(chain)
     yield from _of_arms(chain)
@@ -126,9 +109,9 @@ def _of_boards(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     size = size_of(chain, seen)
     remedy = 'measure the print, and give square and marker in metres'
     what = f'the board is stated {float(f"{1.0 / size:.3g}"):g} times as large as it is'
-    yield Suspect(what, remedy, (_scaled(size),), published=remedy)
+    yield Suspect(what, remedy, (scaled(size),), published=remedy)
     remedy = 'give images and corners as the camera sees them, u to the right and v down'
-    yield Suspect('the images are mirrored', remedy, (_mirrored,), published=remedy)
+    yield Suspect('the images are mirrored', remedy, (mirrored,), published=remedy)
 
 
 def _in_sources(on_flange: bool) -> str:
@@ -138,18 +121,18 @@ def _in_sources(on_flange: bool) -> str:
 def _units(chain: Chain) -> Iterator[Suspect]:
     """Yield units of lengths, and of angles at the same time."""
     whole = 'positions and linear joints' if _linear(chain) else 'positions'
-    degrees = _of_kind(chain, 'revolute', np.radians(1.0))
+    degrees = of_kind(chain, 'revolute', np.radians(1.0))
     for unit, size in SCALES.items():
         for way, option, factor in (
             (f'in {unit}, not metres', f'--length {unit}', size),
             (f'in metres, not {unit}', '--length m', 1.0 / size),
         ):
-            what, lengths = f'the {whole} are {way}', _lengths(chain, factor)
-            yield Suspect(what, option, lengths)
+            what, changes = f'the {whole} are {way}', lengths(chain, factor)
+            yield Suspect(what, option, changes)
             both = f'{what} and the joint values in degrees'
-            yield Suspect(both, f'{option} --joint-angle deg', (*lengths, degrees), 2)
+            yield Suspect(both, f'{option} --joint-angle deg', (*changes, degrees), 2)
     if _linear(chain):
-        yield from _of_lengths('positions', 'xyz', _scaled)
+        yield from _of_lengths('positions', 'xyz', scaled)
 
 
 def _linear(chain: Chain) -> list[str]:
@@ -173,11 +156,11 @@ def _of_coordinates(seen: Observations) -> Iterator[Suspect]:
             given = [f'{"-" * (n < 0)}{"xyz"[k]}' for n, k in zip(signs, order, strict=True)]
             option = '--columns x={},y={},z={}'.format(*given)
             what = f'the coordinates x, y, z of the positions are {", ".join(given)}'
-            changes = (*back, _in_axes(matrix), *back)
+            changes = (*back, in_axes(matrix), *back)
             rank = 1 + bool(np.linalg.det(matrix) > 0.0)  # Euler angles' may look so
             yield Suspect(what, option, changes, rank, part='measured')
     for k, name in enumerate('xyz'):
-        own = partial(_scaled, axis=k)
+        own = partial(scaled, axis=k)
         for each in _of_lengths(f'{name} coordinates alone', name, own):
             yield replace(each, changes=(*back, *each.changes, *back))
 
@@ -192,17 +175,17 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
         Suspect(
             'the quaternions are w x y z, not x y z w',
             '--quaternion wxyz',
-            (_with(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [1, 2, 3, 0]])), *back),
+            (with_turn(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [1, 2, 3, 0]])), *back),
         ),
         Suspect(
             'the quaternions are x y z w, not w x y z',
             '--quaternion xyzw',
-            (_with(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [3, 0, 1, 2]])), *back),
+            (with_turn(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [3, 0, 1, 2]])), *back),
         ),
         Suspect(
             'the rotations are transposed: they are of the device in the target',
             '--columns qx=-qx,qy=-qy,qz=-qz',
-            (_with(lambda turns: np.swapaxes(turns, 1, 2)), *back),
+            (with_turn(lambda turns: np.swapaxes(turns, 1, 2)), *back),
         ),
     ]
     if back:
@@ -212,7 +195,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
         what = 'the poses are of the world in the target, as from a camera on the flange'
         remedy = '--eye-in-hand (or --inverse, where the device stands)'
         ways.append(Suspect(what, remedy, (Observations.inverted,), published=_in_sources(True)))
-    in_mm, degrees = _lengths(chain, SCALES['mm']), _of_kind(chain, 'revolute', np.radians(1.0))
+    in_mm, degrees = lengths(chain, SCALES['mm']), of_kind(chain, 'revolute', np.radians(1.0))
     for way in ways:
         yield replace(way, changes=(*back, *way.changes))
         for units, option, others in (
@@ -247,7 +230,7 @@ def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     largest = NEARER * max(away(seen), float(np.median(between)))
     back = (Observations.inverted,) if seen.inverse else ()
     for what, remedy, turn in misread():
-        found = Suspect(what, remedy, (*back, _with(turn), *back), 2)
+        found = Suspect(what, remedy, (*back, with_turn(turn), *back), 2)
         if away(*found.undone((seen,))) < largest:
             yield found
 
@@ -268,7 +251,7 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
         what = f'{names[i]} and {names[j]} are swapped'
         remedy = f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}'
         published = 'swap them in joint_names, start without resume'
-        change = (_joints(same[order]),)
+        change = (joints_by(same[order]),)
         yield Suspect(what, remedy, change, 2, published=published, part='order')
     last = len(names)
     orders = {'in the order from tool to base': [*range(last)][::-1]} if last > 3 else {}
@@ -278,19 +261,19 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
     for where, places in orders.items():
         columns = ','.join(f'q{k}=q{place + 1}' for k, place in enumerate(places, 1))
         published = 'set the order of joint_names, start without resume'
-        what, change = f'the joints are {where}', (_joints(same[places]),)
+        what, change = f'the joints are {where}', (joints_by(same[places]),)
         yield Suspect(what, f'--columns {columns}', change, 2, published=published, part='order')
     ends = ((0, 'device moves'), (len(names) - 1, 'target does not move'))
     for k, stands in ends:
         what, remedy = f'the {stands} with {names[k]}', 'leave this joint out of the chain file'
-        still = _joints(same - np.outer(same[k], same[k]))
+        still = joints_by(same - np.outer(same[k], same[k]))
         yield Suspect(what, f'{remedy}, or --columns q{k + 1}=0', (still,), published=remedy)
     for k in range(1, len(names)):
         for way in '+-' if revolute[k] and revolute[k - 1] else '':
             coupled = same + float(f'{way}1') * np.outer(same[k], same[k - 1])
             what = f'{names[k]} is not given against {names[k - 1]}: they are coupled'
             remedy = f'--columns q{k + 1}=q{k + 1}{way}q{k}'
-            yield Suspect(what, remedy, (_joints(coupled),), 2, part=names[k])
+            yield Suspect(what, remedy, (joints_by(coupled),), 2, part=names[k])
 
 
 def hidden(chain: Chain, others: Sequence[Suspect]) -> list[tuple[Suspect, ...]]:
@@ -307,7 +290,7 @@ def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
         name, column = chain.joint_names[k], f'q{k + 1}'
         for one, others, _, size in MIXED_UP_UNITS:
             what = f'{name} is in {one}, the other joints in {others}'
-            change = _joints(np.diag(np.where(np.arange(len(chain.joints)) == k, size, 1.0)))
+            change = joints_by(np.diag(np.where(np.arange(len(chain.joints)) == k, size, 1.0)))
             remedy = f'--columns {column}={column}*{size:.9g}'
             yield Suspect(what, remedy, (change,), 2, part=name)
 
@@ -327,7 +310,7 @@ def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> 
     return Suspect(
         f'{chain.joint_names[k]} {" and ".join(whats)}',
         f'{remedy}, or --columns q{k + 1}={column}',
-        (_joints(np.diag(np.where(own, sign, 1.0)), angle * own),),
+        (joints_by(np.diag(np.where(own, sign, 1.0)), angle * own),),
         len(whats),
         published=remedy,
         part=chain.joint_names[k],
@@ -364,37 +347,3 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
             published = f'set chain (--chain) to {ours.name}'
             arm = replace(ours, base=chain.base, tool=chain.tool)
             yield Suspect(what, remedy, rank=2, chain=arm, published=published)
-
-
-def _joints(matrix: FloatArray, shift: FloatArray | float = 0.0) -> DataChange:
-    return lambda each: replace(each, joints=each.joints @ matrix.T + shift)
-
-
-def _of_kind(chain: Chain, kind: str, size: float) -> DataChange:
-    return _joints(np.diag([size if joint.type == kind else 1.0 for joint in chain.joints]))
-
-
-def _lengths(chain: Chain, size: float) -> tuple[DataChange, DataChange]:
-    """Return what `--length` changes: positions and the values of prismatic joints."""
-    return _scaled(size), _of_kind(chain, 'prismatic', size)
-
-
-def _scaled(size: float, axis: int | None = None) -> DataChange:
-    sizes = np.where(np.isin(np.arange(3), range(3) if axis is None else axis), size, 1.0)
-    return lambda each: replace(each, positions=sizes * each.positions)
-
-
-def _in_axes(matrix: FloatArray) -> DataChange:
-    return lambda each: replace(each, positions=each.positions @ matrix.T)
-
-
-def _with(turn: Turn) -> DataChange:
-    return lambda each: replace(each, rotations=turn(each.rotations))
-
-
-def _mirrored(each: Observations) -> Observations:
-    """Return the measurements with the y axis of the device reversed."""
-    mirror = np.diag([1.0, -1.0, 1.0])
-    return replace(
-        each, positions=each.positions @ mirror, rotations=mirror @ each.rotations @ mirror
-    )

@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from calib_ros.decision.suspects import Sets
+from calib_ros.decision.undoing import Sets
 from calib_ros.estimation.identifiability import excited
 from calib_ros.estimation.leastsquares import System, factor_of, minimise
 from calib_ros.estimation.levels import CLEARLY, MOST_OUTLIERS

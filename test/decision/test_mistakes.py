@@ -13,7 +13,7 @@ from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.lost_rows import dead
 from calib_ros.decision.mistakes import explained
 from calib_ros.decision.rotation_conventions import misread
-from calib_ros.decision.suspects import _mirrored, _scaled
+from calib_ros.decision.undoing import mirrored, scaled
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame, Joint
 
@@ -200,7 +200,7 @@ SEVERAL = {
         ('--columns q1=q5,q5=q1', 'elbow_joint counts the other way round'),
     ),
     'left-handed, in mm': (
-        lambda e: _scaled(1e3)(_mirrored(e)),
+        lambda e: scaled(1e3)(mirrored(e)),
         ('(--length mm)', 'axes of the measuring device are left-handed'),
     ),
     'two units': (

@@ -19,7 +19,7 @@ from calib_ros.decision.mistakes import (
     _suspicious,
     explained,
 )
-from calib_ros.decision.suspects import Suspect
+from calib_ros.decision.undoing import Suspect
 
 FAULTY = SimpleNamespace(largest_error=0.5, largest_length=0.1, largest_angle=0.2, sets=())
 

@@ -13,7 +13,8 @@ from fits import SCARA
 from calib_ros import load_chain
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.printed_board import size_of
-from calib_ros.decision.suspects import Suspect, hidden, suspects
+from calib_ros.decision.suspects import hidden, suspects
+from calib_ros.decision.undoing import Suspect
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 

@@ -13,7 +13,7 @@ from calib_ros import Problem, identify, load_chain
 from calib_ros.apply import simulation
 from calib_ros.decision.mistakes import Explained
 from calib_ros.decision.reasons import Reason, Rule
-from calib_ros.decision.suspects import Suspect
+from calib_ros.decision.undoing import Suspect
 from calib_ros.report import advice
 
 
