@@ -231,6 +231,16 @@ def spoilt(problem):
                 measured,
             ),
         )
+    for k, joint in enumerate(chain.joints):
+        for kind in ('a', 'd', 'alpha'):
+            arm = list(chain.joints)
+            arm[k] = replace(joint, **{kind: -getattr(joint, kind)})
+            if arm != [*chain.joints]:
+                yield (
+                    'sign in the DH table',
+                    f'{kind} of {names[k]} has the other sign',
+                    replace(problem, chain=replace(chain, joints=tuple(arm), parallel=None)),
+                )
     other = 'modified' if chain.convention == 'standard' else 'standard'
     yield (
         'standard and modified DH',

@@ -317,6 +317,21 @@ def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> 
     )
 
 
+def _of_signs(chain: Chain) -> Iterator[Suspect]:
+    """Yield that the DH table has other signs: of one joint, or of one kind in all."""
+    every = range(len(chain.joints))
+    for kind, which in product(('a', 'd', 'alpha'), (every, *((k,) for k in every))):
+        joints = list(chain.joints)
+        for k in which:
+            joints[k] = replace(joints[k], **{kind: -getattr(joints[k], kind)})
+        if joints != [*chain.joints]:
+            of = chain.joint_names[which[0]] if len(which) == 1 else 'all joints'
+            what = f'{kind} of {of} has the other sign'
+            remedy = f'correct {kind} in the chain file'
+            arm = replace(chain, joints=tuple(joints), parallel=None)
+            yield Suspect(what, remedy, rank=2, chain=arm, published=remedy)
+
+
 def _of_arms(chain: Chain) -> Iterator[Suspect]:
     """Yield lengths in mm, the other convention, wrong frames, and arms with like joints."""
     mm = SCALES['mm']
@@ -328,6 +343,7 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
     remedy = f'convention: {other} in the chain file'
     arm = replace(chain, convention=other, parallel=None)
     yield Suspect(what, remedy, rank=3, chain=arm, published=remedy)
+    yield from _of_signs(chain)
     held = [key for key in ('base', 'tool') if chain.frame(key).fixed]
     for keys in dict.fromkeys(((*held,), (*held[:1],), (*held[1:],))):
         if keys:
