@@ -156,18 +156,24 @@ def _of_the_gain(
         yield Reason(Rule.REGION, text)
 
 
-def out_of_scale(scale: float, printed: bool = False) -> str:
+def out_of_scale(scale: float, printed: bool = False, checked: bool = False) -> str:
     """Return that a scale of the device, given minus one, may make the calibrated arm worse.
 
     Of a `printed` board it is that of its stated size.
     """
     way, size = ('grow', 'large') if scale > 0.0 else ('shrink', 'small')
+    text = f'all lengths of the arm {way} alike, by {percent(abs(scale))} %, '
+    if checked:
+        return (
+            f'{text}more than sigma_scale allows: measure a known length, or the printed board, '
+            'again'
+        )
     cause, check = 'the measuring device were out of scale', 'If a known length shows that its'
     if printed:
         cause, check = f'the board were stated too {size}', 'Measure the print; if its'
     return (
-        f'all lengths of the arm {way} alike, by {percent(abs(scale))} %, as if {cause}; then the '
-        f'correction would make the arm worse. {check} scale is right, set sigma_scale'
+        f'{text}as if {cause}; then the correction would make the arm worse. {check} scale is '
+        'right, set sigma_scale'
     )
 
 

@@ -29,11 +29,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import compress
 
 import numpy as np
+from scipy import special
 
-from calib_ros.decision.acceptance import out_of_scale, percent
+from calib_ros.decision.acceptance import out_of_scale
 from calib_ros.decision.misfits import explained_share
 from calib_ros.decision.printed_board import stretched
 from calib_ros.decision.reasons import Reason, Rule
@@ -47,9 +47,7 @@ from calib_ros.estimation.levels import (
     ALIKE,
     CERTAIN,
     CLEARLY,
-    CONFIDENT,
     NEARER,
-    PRINTED,
     SURE,
     TELLING,
     chance_of,
@@ -110,33 +108,14 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
 def _scale(problem: Problem, result: Identification) -> Iterator[Reason]:
     """Yield that a device out of scale does harm or is too likely to, if nothing else refuses.
 
-    Also if its scale was checked, but all lengths grew alike, and by more than a print may be off
-    and `sigma_scale` allows.
+    Also if its scale was checked, but almost certainly is not what `sigma_scale` states.
     """
     region, found = result.region, result.posterior
-    if result.refusals:
+    if result.refusals or region is None:
         return
-    if region and region.by_scale >= HARMFUL:
-        yield Reason(Rule.SCALE, out_of_scale(found.scale))
-    if not problem.sigma_scale:
-        return
-    own = [Parameter(name).of_dh and Parameter(name).is_length for name in found.names]
-    grown = (found.offsets + found.shift)[own]
-    lengths = np.array([problem.model.value(name) for name in compress(found.names, own)])
-    scale = float(grown @ lengths) / max(float(lengths @ lengths), 1e-300)
-    alike, whole, freedom = scale * float(grown @ lengths), float(grown @ grown), len(grown) - 1
-    if abs(scale) <= max(PRINTED, problem.sigma_scale) or alike <= CONFIDENT * whole:
-        return
-    # a few lengths of an arm may be so by chance; a print is more likely to be off
-    squares = alike * freedom / max(whole - alike, 1e-300)
-    certain = chance_of(squares, 1, max(freedom, 1)) < 1.0 - CERTAIN
-    if certain or all(each.pixels is not None for each in problem.sets):
-        text = (
-            f'all lengths of the arm {"grow" if scale > 0.0 else "shrink"} alike, by '
-            f'{percent(abs(scale))} %, more than sigma_scale allows: measure a known length, or '
-            'the printed board, again'
-        )
-        yield Reason(Rule.SCALE, text)
+    certain = problem.sigma_scale and found.rival and special.expit(found.rival[0]) > CERTAIN
+    if region.by_scale >= HARMFUL or certain:
+        yield Reason(Rule.SCALE, out_of_scale(found.scale, checked=bool(problem.sigma_scale)))
 
 
 def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:

@@ -25,7 +25,7 @@ from calib_ros.decision.drift import inverse_root
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.estimation.evidence import Mixed, Posterior
 from calib_ros.estimation.joint_errors import NOTHING
-from calib_ros.estimation.levels import KNOWN, UNUSUAL
+from calib_ros.estimation.levels import KNOWN
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.chain import Chain
@@ -211,8 +211,8 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
         inner, limit = inner + added, float(far[shell[-1]])
     by_scale = 0.0
     if posterior.rival is not None:
-        more, mean, covariance = posterior.rival
-        out = float(special.expit(special.logit(UNUSUAL) + more))
+        odds, mean, covariance = posterior.rival
+        out = float(special.expit(odds))
         doubts = judge.of_the_arm([(1.0, mean, covariance)])
         by_scale = out * max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts))
     share = float(np.mean(far <= limit))

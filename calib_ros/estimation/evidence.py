@@ -20,15 +20,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import TypeAlias
 
 import numpy as np
+from scipy import special
 
 from calib_ros.estimation.considered import Doubted, Doubts, doubted_products, lengths_of, lenses
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
-from calib_ros.estimation.levels import OUT_OF_SCALE, PRINTED, SCALE
+from calib_ros.estimation.levels import CONFIDENT, OUT_OF_SCALE, PRINTED, SCALE, UNUSUAL
 from calib_ros.estimation.sizes import TYPICAL, Evidence, mixed, solved
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -72,7 +73,8 @@ class Posterior(Shown):
     """The posterior of the offsets for each plausible set of sizes, if the device may have a
     scale error and rounded joint values may be off."""
     rival: Mixed | None = None
-    """The same with log odds for a device out of scale; None of a printed board, which may be."""
+    """The same with log odds for a device out of scale, or further than `sigma_scale`; None of a
+    printed board of unchecked scale, which may be."""
     scale: float = 0.0
     """The scale of that device or board, minus one."""
     unmodelled: Unmodelled = NOTHING
@@ -147,30 +149,27 @@ def posterior_of(
     chain = fitted.chain.with_effects(own)
     beside = {name: std for name, std in (rounding or {}).items() if name in names}
     whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
-    if more or beside:
-        sums = doubted_products(whole, every, system, Doubts(beside, lengths, bool(more)), noise)
-    else:
-        products = fitted.products / noise**2
-        sums = Doubted(products, products[:, :0], products[:0, :0])
+    sums = _sums_of(fitted, whole, every, Doubts(beside, lengths, bool(more)), noise)
     offsets = np.append(fitted.offsets, np.zeros(len(sums.plain) - 1 - len(names)))
     alone, along = _about_nominal(sums.plain, offsets)
     matrix, vector = _about_nominal(sums.reduced, offsets)
-    known: dict[str, float] = {**problem.given} | {**lenses(nominal)}
-    if problem.sigma_scale:
-        known['scale'] = problem.sigma_scale
     columns = [*every, *['scale'] * bool(lengths)]
-    groups = [None if n in known else n if n == 'scale' else size_group(chain, n) for n in columns]
-    given = np.array([known.get(n, np.inf) for n in columns]) ** -2
-    evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': scale})
-    considered = {size_group(chain, name) for name in more} - {*groups[: len(names)]}
+    evidence_of = partial(_evidence_of, chain, columns, (matrix, vector))
+    known: dict[str, float] = {**problem.given} | {**lenses(nominal)}
+    checked = {'scale': problem.sigma_scale} if problem.sigma_scale else {}
+    evidence = evidence_of(known | checked, scale)
+    considered = {size_group(chain, name) for name in more}
+    considered -= {size_group(chain, name) for name in names if name not in known}
     size, slope = evidence.most_probable(considered)
-    rival, out, unknown = None, 0.0, judging and lengths and 'scale' not in known
-    if unknown and scale < PRINTED:
-        odds, mean, covariance = evidence.rival('scale', OUT_OF_SCALE, size, considered)
+    rival, out, judges_scale = None, 0.0, judging and lengths
+    if judges_scale and (checked or scale < PRINTED):
+        elsewhere = evidence_of(known, max(OUT_OF_SCALE, scale))
+        odds, mean, covariance = elsewhere.against(evidence, size, considered)
+        odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
         rival, out = (odds, mean[arm], covariance[arm, arm]), float(mean[-1])
     near = evidence.near(size, slope) if judging else []
-    known_by = zip(every, evidence.precision(size).tolist(), strict=False)
-    priors = {name: float(each**-0.5) for name, each in known_by if each > 0.0}
+    usual = zip(every, evidence.precision(size).tolist(), strict=False)
+    priors = {name: float(each**-0.5) for name, each in usual if each > 0.0}
     if judging:
         evidence.widen(size)
     weights, tried = zip(*(near or [(1.0, size)]), strict=True)
@@ -182,10 +181,34 @@ def posterior_of(
     wider = [solved(matrix, vector, each) for each in precisions if near]
     parts = zip(weights, wider, strict=False)
     doubted = tuple((w, centre[arm], root[arm] @ root[arm].T) for w, (centre, root) in parts)
-    out = float(wider[0][0][-1]) if unknown and not rival else out
+    out = float(wider[0][0][-1]) if judges_scale and not rival else out
     found = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
     posterior = Posterior(chain, every, *found, doubted, rival, out)
     return posterior if fitted.held is None else posterior.held_at(*fitted.held)
+
+
+def _sums_of(
+    fitted: Fitted, whole: Chain, every: Sequence[str], doubts: Doubts, noise: float
+) -> Doubted:
+    """Return the products of columns for noise of a size, those of the fit if without doubts."""
+    if doubts.by_device or doubts.sizes:
+        return doubted_products(whole, every, fitted.system, doubts, noise)
+    products = fitted.products / noise**2
+    return Doubted(products, products[:, :0], products[:0, :0])
+
+
+def _evidence_of(
+    chain: Chain,
+    columns: Sequence[str],
+    normal: tuple[FloatArray, FloatArray],
+    known: Mapping[str, float],
+    scale: float,
+) -> Evidence:
+    """Return the evidence of normal equations, with known deviations and the usual `scale`."""
+    own = [n if n == 'scale' else size_group(chain, n) for n in columns]
+    groups = [None if n in known else group for n, group in zip(columns, own, strict=True)]
+    given = np.array([known.get(n, np.inf) for n in columns]) ** -2
+    return Evidence(*normal, given, groups, TYPICAL | {'scale': scale})
 
 
 def _about_nominal(products: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:

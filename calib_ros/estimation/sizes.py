@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -112,21 +111,18 @@ class Evidence:
                     size = tried[1]
         return size, 2.0 * np.maximum(gamma, 0.0) + width
 
-    def rival(
-        self, group: str, typical: float, size: FloatArray, considered: set[str | None]
+    def against(
+        self, usual: Evidence, size: FloatArray, considered: set[str | None]
     ) -> tuple[float, FloatArray, FloatArray]:
-        """Return the log odds of a group being of another `typical` size; mean (P,), covariance.
+        """Return the log odds against the usual evidence at log sizes (G,); mean (P,), covariance.
 
-        Against the most probable log sizes (G,); all are searched again.
+        The most probable sizes are searched anew.
         """
-        other = copy.copy(self)
-        other._typical = self._typical.copy()
-        other._typical[self._names.index(group)] = np.log(typical)
-        found, _ = other.most_probable(considered - {group})
-        more = other._probable(found) - self._probable(size)
-        other.widen(found)
-        mean, root = solved(self._matrix, self._vector, other.precision(found))
-        return more, mean, root @ root.T
+        found, _ = self.most_probable(considered)
+        odds = self._probable(found) - usual._probable(size)
+        self.widen(found)
+        mean, root = solved(self._matrix, self._vector, self.precision(found))
+        return odds, mean, root @ root.T
 
     def _probable(self, size: FloatArray) -> float:
         """Return the log probability of data and log sizes (G,), but for a constant (Laplace)."""

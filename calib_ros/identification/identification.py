@@ -144,7 +144,7 @@ def _region(
     """
     sets, freedom = fitted.problem.sets, fitted.uncertainty.overall
     region = region_of(posterior, sets, freedom)
-    if region is None and posterior.scale:
+    if region is None and posterior.scale and not fitted.problem.sigma_scale:
         checked = replace(fitted, problem=replace(fitted.problem, sigma_scale=SCALE))
         if region_of(posterior_of(checked, size, more, doubts), sets, freedom) is not None:
             return None, posterior.scale

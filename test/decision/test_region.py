@@ -199,9 +199,8 @@ def test_the_risk_is_the_larger_one_of_the_poses_and_of_those_known_as_well(
 
     monkeypatch.setattr(region._Judge, 'risk', risk)
     assert region_of(posterior, sets, np.inf).by_scale == 0.0
-    odds = region.UNUSUAL / (1.0 - region.UNUSUAL) * np.exp(0.5)
     found = region_of(replace(posterior, rival=rival), sets, np.inf)
-    assert found.by_scale == pytest.approx(0.3 * odds / (1.0 + odds))
+    assert found.by_scale == pytest.approx(0.3 / (1.0 + np.exp(-0.5)))
     harmful[0] = True
     assert region_of(posterior, sets, np.inf) is None
 

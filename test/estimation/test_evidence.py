@@ -130,10 +130,12 @@ def test_a_rival_is_of_the_size_that_the_data_tell(scale):
     matrix = np.diag([1.0, 1e2, 1e2, 1e2, 1e6])
     mean = np.array([0.3, 1.0, -1.5, 0.4, scale])
     groups = [None, 'length', 'length', 'angle', 'scale']
-    typical = {'length': 1.0, 'angle': 0.5, 'scale': 1e-2}
-    found = Evidence(matrix, matrix @ mean, np.zeros(5), groups, typical)
-    size, _ = found.most_probable(set())
-    odds, _, covariance = found.rival('scale', 0.25, size, set())
+    typical = {'length': 1.0, 'angle': 0.5}
+    usual, other = (
+        Evidence(matrix, matrix @ mean, np.zeros(5), groups, typical | {'scale': size})
+        for size in (1e-2, 0.25)
+    )
+    odds, _, covariance = other.against(usual, usual.most_probable(set())[0], set())
     assert odds > 1.0 if scale > 1.0 else odds < 1.0
     assert covariance[0, 0] == pytest.approx(1.0)  # without a prior
     size = (1.0 / covariance[4, 4] - 1e6) ** -0.5
