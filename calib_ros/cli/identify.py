@@ -25,9 +25,10 @@ from calib_ros.files import boards
 from calib_ros.files.lenses import read_lens
 from calib_ros.files.loading import Loaded, of_bag, of_table
 from calib_ros.files.rows import identified as row_of
+from calib_ros.identification.age import years_since
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibrated import Recalibration
-from calib_ros.identification.recalibration import recalibrate, years_since
+from calib_ros.identification.recalibration import recalibrate
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of
@@ -104,7 +105,8 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         for warning in loaded.warnings:
             screen.warn(warning)
         new = ('base',) * options.new_base + ('tool',) * options.new_tool
-        years, growth = years_since(previous.record), 1e-3 * options.growth
+        years = years_since(previous.record, loaded.problem.all_sets)
+        growth = 1e-3 * options.growth
         problem = loaded.between(previous.frames_of(loaded.owners))
         with screen.work('looking for what has changed'):
             found = recalibrate(previous, problem, years, growth, new)

@@ -25,10 +25,10 @@ from calib_ros.files.rows import (
     content_hash,
     files_of,
     inputs_of,
-    measured_at,
     samples_hash,
     settings_hash,
 )
+from calib_ros.identification.age import measured_at
 from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.report import page

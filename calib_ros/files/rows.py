@@ -155,19 +155,6 @@ def samples_hash(sets: Sequence[Observations]) -> str:
     return found.hexdigest()
 
 
-def is_time(stamp_ns: int) -> bool:
-    """Tell whether a stamp is a time (from 1973), not since a start or from lines."""
-    return stamp_ns >= 10**17
-
-
-def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None) -> datetime:
-    """Return the time of the last pose, or `otherwise` if stamps are no times."""
-    last = max((int(each.stamps_ns.max()) for each in sets if len(each)), default=0)
-    if not is_time(last):
-        return otherwise or datetime.now(timezone.utc)
-    return datetime.fromtimestamp(last / 1e9, timezone.utc)
-
-
 def identified(result: Identification, about: Filing, warnings: Sequence[str] = ()) -> Row:
     """Return the row of an identification; `warnings` are of the measurements."""
     offsets = {str(each.name): each.offset for each in result.parameters}

@@ -12,7 +12,6 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -24,6 +23,7 @@ from calib_ros.files.history import History
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.tasks import Outcome, Task, sources, work
+from calib_ros.identification.age import A_DAY, NEVER
 from calib_ros.progress import Notify, quiet
 
 NEEDS_DASK = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
@@ -38,7 +38,6 @@ DASK = {
 }
 """Settings of dask: less self-monitoring, which costs more than its work; workers keep freed
 memory [bytes], because getting it back costs a third of a large task's time."""
-NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 class LostError(CalibrationError):
@@ -139,7 +138,7 @@ def _unique(rows: Sequence[Row], key: Callable[[Row], object]) -> tuple[Row, ...
 
 def too_late(row: Row) -> bool:
     """Tell whether a result was filed before its stamps, in any time zone: a wrong clock."""
-    return row.time - row.filed > timedelta(days=1)
+    return row.time - row.filed > A_DAY
 
 
 def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:

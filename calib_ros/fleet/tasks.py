@@ -24,10 +24,10 @@ from calib_ros.files.rows import (
     digest,
     identified,
     inputs_of,
-    measured_at,
 )
 from calib_ros.files.unpacked import RECORDED
 from calib_ros.fleet.plant import Robot
+from calib_ros.identification.age import measured_at
 from calib_ros.report.documents import configuration_yaml
 from calib_ros.report.page import Origin, render
 from calib_ros.report.poses import poses_of

@@ -40,6 +40,7 @@ from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification import records
+from calib_ros.identification.age import recorded_time
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.kinematics.chain_file import (
@@ -104,6 +105,7 @@ class Calibration(Shown):
         rms_mm = round(after.rms_mm, 6)  # as in the file
         record = {
             **made(),
+            'measured': recorded_time(fitted),
             'accepted': result.accepted,
             'world_frame': result.world_frame,
             'samples': len(result.fitted.judged),

@@ -15,12 +15,10 @@ few or similar poses let one cause imitate another.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -38,6 +36,7 @@ from calib_ros.estimation.observations import SOME_POSES, Observations, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER
 from calib_ros.estimation.start import in_new_frames
+from calib_ros.identification.age import drift_of, recorded_time
 from calib_ros.identification.calibration import Calibration, about, made
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.records import Fingerprint
@@ -47,15 +46,6 @@ from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import GROWTH
 from calib_ros.shown import rows_in_words
-
-
-def years_since(record: Mapping[str, Any]) -> float:
-    """Return the age [years] of a calibration by its record, or 1 if not recorded."""
-    try:
-        age = datetime.now(timezone.utc) - datetime.fromisoformat(str(record.get('created')))
-    except (ValueError, TypeError):
-        return 1.0
-    return max(0.0, age.days / 365.25)
 
 
 @as_annotated
@@ -252,9 +242,7 @@ class _Arm:
             chain, names = region.chain, region.names
             square, device = region.square, region.device @ region.device.T
         named = tuple(map(Parameter, names))
-        grown = growth / changes.SIZES['m']  # a year
-        sizes = [grown * changes.SIZES[n.unit] if n.of_dh else 0.0 for n in named]
-        wandered = np.diag(np.square(sizes)) * max(years, 0.0)
+        wandered = np.diag(drift_of(named, growth)) * max(years, 0.0)
         return cls(previous, chain, named, square + wandered, device)
 
     @cached_property
@@ -383,6 +371,7 @@ def _updated(
         **made(),
         **about(chain, before, region),
         'previous': {key: previous.record.get(key) for key in ('created', 'table_sha256')},
+        'measured': recorded_time(problem.all_sets),
         'new_samples': sum(map(len, problem.all_sets)),
         'changed': [changes.reason_in_words(each) for each in changed],
     }

@@ -13,7 +13,7 @@ import numpy as np
 
 import calib_ros
 from calib_ros.decision.comparison import Comparison, ErrorFigures
-from calib_ros.files.rows import is_time
+from calib_ros.identification.age import is_time
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, words

@@ -27,10 +27,10 @@ from calib_ros.files.rows import (
     Row,
     identified,
     inputs_of,
-    measured_at,
     samples_hash,
     settings_hash,
 )
+from calib_ros.identification.age import measured_at
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Progress

@@ -36,8 +36,9 @@ from calib_ros.files.archive import Archive
 from calib_ros.files.cameras import cameras_of
 from calib_ros.files.programs import read_joints
 from calib_ros.files.rows import judged
+from calib_ros.identification.age import years_since
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.recalibration import recalibrate, years_since
+from calib_ros.identification.recalibration import recalibrate
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import documents, words
 from calib_ros.ros.advisor import Guide
@@ -304,7 +305,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:
         calibration, problem = found
-        years = years_since(calibration.record)
+        years = years_since(calibration.record, problem.all_sets)
         updated = recalibrate(calibration, problem, years)
         return words.still_holds(calibration, updated, problem.all_sets)
 

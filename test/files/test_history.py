@@ -14,7 +14,7 @@ from calib_ros import Problem, Settings, identify, load_chain
 from calib_ros.apply import simulation
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.history import History
-from calib_ros.files.rows import Filing, Row, identified, measured_at, samples_hash, settings_hash
+from calib_ros.files.rows import Filing, Row, identified, samples_hash, settings_hash
 
 CHAIN = load_chain('ur10e')
 BEGIN = datetime(2026, 1, 31, 23, 30, 0, 123_456, timezone.utc)
@@ -169,15 +169,6 @@ def test_serials_and_places_that_cannot_be():
             Filing(serial, BEGIN, '', '')
     with pytest.raises(ConfigError, match='history cannot be at'):
         History('nowhere://history')
-
-
-def test_the_time_is_that_of_the_measurement():
-    rng = np.random.default_rng(0)
-    rows = simulation.measure(CHAIN, CHAIN.random_joints(3, rng), rng)
-    assert measured_at([rows], BEGIN) == BEGIN
-    stamps = np.array([0, 1, 2], np.int64) + 1_700_000_000_000_000_000
-    at = measured_at([replace(rows, stamps_ns=stamps)])
-    assert at == datetime.fromtimestamp(1.7e9, timezone.utc)
 
 
 def test_all_that_was_measured_tells_samples_apart():

@@ -1,0 +1,77 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How a calibration ages: times of measurements, and the usual drift of an arm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime, timedelta, timezone
+from typing import Any
+
+import numpy as np
+
+from calib_ros.decision.changes import SIZES
+from calib_ros.errors import InputError
+from calib_ros.estimation.observations import Observations
+from calib_ros.kinematics.parameter import Parameter
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import GROWTH
+
+YEAR = timedelta(days=365.25)
+A_DAY = timedelta(days=1)  # clocks of any two time zones differ by less
+NEVER = datetime.fromtimestamp(0, timezone.utc)
+
+
+def drift_of(names: Sequence[Parameter], growth: float = GROWTH) -> FloatArray:
+    """Return variances (P,) of the usual drift (a random walk) a year, by that of lengths [m]."""
+    sizes = [growth / SIZES['m'] * SIZES[name.unit] if name.of_dh else 0.0 for name in names]
+    return np.square(sizes)
+
+
+def is_time(stamp_ns: int) -> bool:
+    """Tell whether a stamp is a time (from 1973), not since a start or from lines."""
+    return stamp_ns >= 10**17
+
+
+def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None) -> datetime:
+    """Return the time of the last pose, or `otherwise` if stamps are no times."""
+    last = max((int(each.stamps_ns.max()) for each in sets if len(each)), default=0)
+    if not is_time(last):
+        return otherwise or datetime.now(timezone.utc)
+    return datetime.fromtimestamp(last / 1e9, timezone.utc)
+
+
+def recorded_time(sets: Sequence[Observations]) -> str | None:
+    """Return the time of the last pose for a record; now if that is later, None if no time."""
+    time, now = measured_at(sets, NEVER), datetime.now(timezone.utc)
+    return None if time == NEVER else min(time, now).isoformat(timespec='seconds')
+
+
+def years_since(record: Mapping[str, Any], sets: Sequence[Observations] = ()) -> float:
+    """Return the age [years] of a calibration when new poses were measured.
+
+    If one of the two has no times: until now, since it was made; 1 if not known. Raises InputError
+    if the new poses are older than its own.
+    """
+    now = datetime.now(timezone.utc)
+    then, new = _time_in(record, 'measured'), min(measured_at(sets, NEVER), now)
+    if then is None or new == NEVER:
+        made = _time_in(record, 'created')
+        if made is None or made - now > A_DAY:
+            return 1.0
+        return max(0.0, (now - made) / YEAR)
+    if then - new > A_DAY:
+        raise InputError(
+            f'the new poses were measured on {new:%Y-%m-%d}, before those of the earlier '
+            f'calibration ({then:%Y-%m-%d}): update it in the order of time; if they are newer, '
+            'the clock of the recorder is wrong'
+        )
+    return max(0.0, (new - then) / YEAR)
+
+
+def _time_in(record: Mapping[str, Any], key: str) -> datetime | None:
+    with suppress(ValueError):
+        time = datetime.fromisoformat(str(record.get(key)))
+        return time if time.tzinfo else None
+    return None
