@@ -3,11 +3,12 @@
 """Did the arm change between nights, when, and which joint (docs/fleet.md)?
 
 Night k brings the arm's parameters x_k with covariance C_k, without base and tool, and how they
-follow waves of its wobbling axes, T_k. For each of the last m nights (LAGS) the mean of these m is
-compared with the mean of the earlier nights, both weighted by information:
+follow waves of its wobbling axes, T_k. The usual drift is no change: a random walk that adds G in
+a year (`age.py`). The mean of the last m nights (LAGS) is compared with the arm that the earlier
+nights tell, the mean y years older (Kalman 1960), both weighted by information:
 
     d = x_after - x_before,   t = T_after - T_before,   u = S^-1 d,   W = S^-1
-    S = s^2 (C_after + C_before + w^2 t t^T)
+    S = s^2 (C_after + C_before + G y + w^2 t t^T)
 
 That j alone, a joint or two, changed by d_j = W_jj^-1 u_j with covariance W_jj^-1 explains
 g_j = u_j^T W_jj^-1 u_j of the difference, which has an F distribution if nothing changed: as many
@@ -32,6 +33,7 @@ from itertools import combinations
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy import special
 
 from calib_ros.decision.changes import (
@@ -43,12 +45,14 @@ from calib_ros.decision.changes import (
 )
 from calib_ros.estimation.levels import CLEARLY, KNOWN, TELLING
 from calib_ros.files.rows import Row
+from calib_ros.identification.age import YEAR, drift_of
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import counted, some
 
-LAGS = tuple(2**k for k in range(TELLING.bit_length()))
-"""Nights, 1 to TELLING, in which a change is sought: large ones show at once, small ones later."""
+LAGS = tuple(2**k for k in range(1 + TELLING))
+"""Nights, 1 to 256, in which a change is sought: large ones show at once, small and slow ones
+later."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,16 +205,22 @@ def _tests(fitted: Sequence[_Fitted], names: tuple[Parameter, ...]) -> _Tests:
     sizes = [[r.tilt for r, _ in fitted[:k] if r.tilt is not None] for k in range(1, count + 1)]
     size_of = np.array([np.median(each or 0.0) for each in sizes])
     whole, pulled = np.cumsum(information, axis=0), np.cumsum(pulls, axis=0)
+    years = np.array([(row.time - fitted[0][0].time) / YEAR for row, _ in fitted])
+    drifts = np.diag(drift_of(names))
+    covariances, means = _known(information, pulls, years, drifts)
     chances = np.ones((len(LAGS), count, len(groups)))
     several = np.ones((len(LAGS), count))
     pull = np.zeros((len(LAGS), count, size))
     weight = np.zeros((len(LAGS), count, size, size))
     scatter = np.ones(count)
-    for number, lag in enumerate(LAGS):
+    for number, lag in enumerate(lag for lag in LAGS if lag < count):
         nights = np.arange(lag, count)
-        before = np.linalg.inv(whole[nights - lag])
+        last = years[nights - lag]
+        passed = sliding_window_view(years, lag)[1:] - last[:, np.newaxis]
+        walked = passed @ np.arange(2 * lag - 1, 0, -2) / lag**2  # of the mean of a walk
+        before = covariances[nights - lag] + drifts * walked[:, np.newaxis, np.newaxis]
         after = np.linalg.inv(whole[nights] - whole[nights - lag])
-        moved = after @ (pulled[nights] - pulled[nights - lag]) - before @ pulled[nights - lag]
+        moved = after @ (pulled[nights] - pulled[nights - lag]) - means[nights - lag]
         moved, tilts = moved[..., 0], size_of[nights, np.newaxis, np.newaxis] * moved[..., 1:]
         inverse = np.linalg.inv(after + before + tilts @ np.swapaxes(tilts, 1, 2))
         force = np.einsum('kpr,kr->kp', inverse, moved)
@@ -256,6 +266,23 @@ def _information(
         information.append(whole[np.ix_(which, which)])
         pulls.append((whole @ np.column_stack([row.offsets[own], tilts]))[which])
     return np.array(information), np.array(pulls)
+
+
+def _known(
+    information: FloatArray, pulls: FloatArray, years: FloatArray, drifts: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return covariance (K, P, P) and mean (K, P, 1 + T) after each night, by all up to it.
+
+    `drifts` (P, P) are added in a year.
+    """
+    covariance, mean = np.zeros_like(information), np.zeros_like(pulls)
+    covariance[0] = np.linalg.inv(information[0])
+    mean[0] = covariance[0] @ pulls[0]
+    for k in range(1, len(years)):
+        known = np.linalg.inv(covariance[k - 1] + drifts * (years[k] - years[k - 1]))
+        covariance[k] = np.linalg.inv(known + information[k])
+        mean[k] = covariance[k] @ (known @ mean[k - 1] + pulls[k])
+    return covariance, mean
 
 
 def _groups(names: Sequence[Parameter]) -> tuple[tuple[str, ...], ...]:

@@ -14,6 +14,7 @@ from calib_ros.apply import simulation
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.rows import Filing, identified
 from calib_ros.fleet.watch import watch
+from calib_ros.identification.age import drift_of
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import chain_document, load_chain
 from calib_ros.kinematics.parameter import Parameter
@@ -114,6 +115,19 @@ def test_a_drift_that_no_night_shows_is_found(first, rng):
     assert changes
     for change in changes:
         assert 'wrist_1_joint' in {reason.owner for reason in change.reasons}
+
+
+def test_the_usual_drift_is_no_event_and_hides_none(first, rng):
+    """A random walk that `recalibrate` expects too: 0.02 mm and 0.04 mrad in a year."""
+    step = np.sqrt(drift_of([*map(Parameter, first.names)]) / 365.25)
+    for _ in range(2):
+        walk = np.cumsum(step * rng.normal(size=(210, len(step))), axis=0)
+        still = nights(first, rng, 210, (200, BUMPS[0]))
+        rows = [replace(r, offsets=r.offsets + w) for r, w in zip(still, walk, strict=True)]
+        assert watch(rows[:200], 100.0).changes == ()
+        (change,) = watch(rows, 100.0).changes
+        assert 'elbow_joint' in {joint_of(change), *change.pair}
+        assert change.seen <= rows[201].time
 
 
 def test_several_changes_and_those_before_a_date(first, rng):
