@@ -4,14 +4,15 @@
 
 A few hundred numbers in it identify the fitted measurements. Each row has a hash; the smallest
 `KEPT` hashes are a random sample of the rows. A further row with a hash up to the largest kept one
-is either among them or was not fitted (Broder 1997).
+is either among them or was not fitted (Broder 1997). Of updates, by a few rows each, the latest
+rows are kept too: a sample of many others may have none of them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -285,21 +286,24 @@ def hashes(sets: Sequence[Observations]) -> Hashes:
 
 @dataclass(frozen=True, eq=False)
 class Fingerprint:
-    """The smallest hashes of `count` rows, in ascending order."""
+    """The smallest hashes of `count` rows, ascending, and the `latest` of later fits."""
 
     count: int
     least: Hashes
+    latest: Hashes = field(default_factory=lambda: np.zeros(0, dtype=np.uint64))
 
     @classmethod
     def of(cls, sets: Sequence[Observations], earlier: Fingerprint | None = None) -> Fingerprint:
         """Return the fingerprint of rows and of those fitted earlier."""
         new = hashes(sets)
-        earlier = earlier or cls(0, new[:0])
+        if earlier is None:
+            return cls(len(new), np.unique(new)[:KEPT])
         both = np.union1d(earlier.least, earlier.comparable(new))[:KEPT]
-        return cls(earlier.count + len(new), both)
+        latest = np.concatenate([new, earlier.latest])[:KEPT]
+        return cls(earlier.count + len(new), both, latest)
 
     def comparable(self, rows: Hashes) -> Hashes:
-        """Return which hashes of rows (N,) would be here if the rows were fitted."""
+        """Return which hashes of rows (N,) would be among the smallest if the rows were fitted."""
         every = self.count <= len(self.least)
         return rows if every else rows[rows <= self.least.max(initial=0)]
 
@@ -309,19 +313,27 @@ class Fingerprint:
         if 'rows' not in record:
             return None
         try:
-            least = np.frombuffer(bytes.fromhex(record['rows']['least']), '>u8')
-            return cls(int(record['rows']['count']), least.astype(np.uint64))
+            known = {'latest': '', **record['rows']}
+            least, latest = (
+                np.frombuffer(bytes.fromhex(known[key]), '>u8').astype(np.uint64)
+                for key in ('least', 'latest')
+            )
+            return cls(int(known['count']), least, latest)
         except (KeyError, TypeError, ValueError) as err:
             raise ConfigError(f'{where}: calibration.rows is damaged: identify again') from err
 
     def document(self) -> dict[str, Any]:
         """Return the fingerprint for the record."""
-        return {'count': self.count, 'least': self.least.astype('>u8').tobytes().hex()}
+        kept = {'least': self.least, 'latest': self.latest}
+        texts = {key: each.astype('>u8').tobytes().hex() for key, each in kept.items()}
+        return {'count': self.count, **texts}
 
     def share(self, sets: Sequence[Observations]) -> float:
         """Return the estimated share of rows that were fitted."""
-        rows = self.comparable(hashes(sets))
-        return float(np.isin(rows, self.least).mean()) if rows.size else 0.0
+        rows = hashes(sets)
+        sample = self.comparable(rows)
+        pairs = (sample, self.least), (rows, self.latest)
+        return max(float(np.isin(own, kept).mean()) if own.size else 0.0 for own, kept in pairs)
 
 
 def reused_in_words(share: float) -> str:

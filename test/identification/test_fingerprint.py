@@ -54,6 +54,19 @@ def test_rows_that_are_fitted_later_are_known_as_well(count):
     assert found.share([rows(count, 2)]) == 0.0
 
 
+@pytest.mark.parametrize('count', [60, 50 * KEPT])
+def test_the_few_rows_of_an_update_are_known_after_many_others(count):
+    """A session filed twice would count twice; of 12,800 rows 256 are kept as a sample."""
+    found = Fingerprint.of([rows(count)])
+    for update in range(1, 41):
+        found = Fingerprint.of([rows(8, update)], found)
+        found = Fingerprint.of_record({'rows': found.document()}, 'file')
+        assert found.share([rows(8, update)]) == found.share([rows(8, max(1, update - 20))]) == 1.0
+        assert found.share([rows(8, 100)]) == 0.0
+    assert 0.5 <= found.share([rows(8, 40), rows(8, 100)]) < 1.0
+    assert len(found.latest) == KEPT
+
+
 @pytest.mark.parametrize('wrong', [1, {}, {'count': 1, 'least': 'x'}, {'count': 1, 'least': '00'}])
 def test_what_is_no_fingerprint_is_refused(wrong):
     with pytest.raises(ConfigError, match=r'calibration\.rows'):
