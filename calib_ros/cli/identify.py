@@ -26,7 +26,7 @@ from calib_ros.files.lenses import read_lens
 from calib_ros.files.loading import Loaded, of_bag, of_table
 from calib_ros.files.rows import identified as row_of
 from calib_ros.identification.age import years_since
-from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.recalibration import recalibrate
 from calib_ros.kinematics.chain import Chain
@@ -102,6 +102,9 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         previous = inputs.calibration_of(
             options.previous, 'identify --previous', loaded.problem.chain
         )
+        serial = previous.serial_of(str(options.previous), options.serial)
+        known = {'robot_serial': serial} if serial else {}
+        previous = replace(previous, record={**previous.record, **known})
         for warning in loaded.warnings:
             screen.warn(warning)
         new = ('base',) * options.new_base + ('tool',) * options.new_tool
@@ -116,7 +119,7 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         if found.accepted:
             contents['calibration.yaml'] = found.calibration.dump()
         elif options.out is not None:
-            contents |= _set_aside(options.out)
+            contents |= _set_aside(options.out, options.previous)
     if options.json:
         screen.data(text)
     else:
@@ -365,7 +368,13 @@ def result_files(
     return contents | _set_aside(out)
 
 
-def _set_aside(out: Path) -> dict[str, bytes]:
-    """Return the calibration accepted earlier, if any, under another name."""
+def _set_aside(out: Path, previous: Path | None = None) -> dict[str, bytes]:
+    """Return the calibration accepted earlier, if any, under another name.
+
+    The `previous` one, which could not be brought up to date, stays.
+    """
     earlier = out / 'calibration.yaml'
-    return {'calibration.previous.yaml': earlier.read_bytes()} if earlier.exists() else {}
+    if not earlier.exists():
+        return {}
+    stays = previous is not None and earlier.samefile(calibration_file(previous))
+    return {earlier.name if stays else 'calibration.previous.yaml': earlier.read_bytes()}

@@ -78,11 +78,12 @@ def calibration_of(path: Path, command: str, nominal: Chain | None = None) -> Ca
     """Return the calibration in a file, or in the folder of an identification."""
     refuse_others(path, command, 'chain', 'result')
     if path.is_dir() and not calibration_file(path).exists():
-        if (path / 'result.json').exists():
-            raise InputError(
-                f'the result in {path} was not accepted, so there is no calibration; '
-                f'{path / "report.html"} says why and what to do'
-            )
+        for name in ('report.html', 'result.json'):  # updates have no report
+            if (path / name).exists():
+                raise InputError(
+                    f'the result in {path} was not accepted, so there is no calibration; '
+                    f'{path / name} says why and what to do'
+                )
         raise InputError(f'{path} holds no calibration.yaml: {GIVE_FOLDER}')
     if not path.exists():
         raise InputError(f'there is no calibration at {path}: {GIVE_FOLDER}')

@@ -2,13 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A few poses, and the calibration of before (`benchmarks/recalibration.py` has the figures)."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from fits import NOISE, SCARA, SIGMAS, UR10E, problem, rms
-from measured import rows_of, write_csv
 from robots import DATA, needs_data
 
 from calib_ros import Calibration, Problem, identify, load_chain, read_table, recalibrate
@@ -312,34 +310,6 @@ def test_what_is_needed_is_asked_for(earlier):
     strange = replace(few.observations, base='base_other')
     with pytest.raises(InputError, match='knows the frames base, tool, not base_other'):
         recalibrate(previous, Problem(UR10E, strange), 0.1)
-
-
-def test_the_command_writes_the_calibration_brought_up_to_date(earlier, run, tmp_path):
-    true, previous = earlier
-    (tmp_path / 'earlier.yaml').write_text(previous.dump())
-    seen = problem(true.with_offsets({'elbow_joint.theta': 5e-4}), 8, 1).observations
-    write_csv(tmp_path / 'few.csv', rows_of(seen, 0))
-    given = ['identify', 'few.csv', '--chain', 'ur10e']
-    given += ['--sigma-position', '5e-5', '--sigma-orientation', '2e-4', '--previous']
-    status, said, _ = run(*given, 'earlier.yaml', '--out', 'out')
-    assert status == 0
-    assert 'elbow_joint.theta by +0.' in said
-    document = json.loads((tmp_path / 'out' / 'result.json').read_text())
-    assert document['changed'][0][0]['owner'] == 'elbow_joint'
-    text = (tmp_path / 'out' / 'calibration.yaml').read_text()
-    read = parse_calibration(text, 'c.yaml', UR10E)
-    assert read.record['previous']['table_sha256'] == previous.record['table_sha256']
-    assert read.record['table_sha256'] != previous.record['table_sha256']
-    assert read.chain.value('elbow_joint.theta') == pytest.approx(
-        previous.chain.value('elbow_joint.theta') + 5e-4, abs=1e-4
-    )
-    status, said, _ = run(*given, 'out', '--out', 'again')
-    assert status == 3
-    assert 'the calibration was fitted to these measurements' in ' '.join(said.split())
-    assert not (tmp_path / 'again' / 'calibration.yaml').exists()
-    # over what it brings up to date
-    assert run(*given, 'out', '--out', 'out', '--force')[0] == 3
-    assert (tmp_path / 'out' / 'calibration.previous.yaml').read_text() == text
 
 
 @needs_data

@@ -1,0 +1,72 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`identify --previous`, night after night."""
+
+import json
+
+import pytest
+from fits import UR10E, arm, problem
+from measured import rows_of, write_csv
+
+from calib_ros import Calibration, identify
+from calib_ros.identification.calibration import parse_calibration
+
+
+@pytest.fixture(scope='module')
+def earlier():
+    """Return an arm, and its calibration as it is read from a file."""
+    true = arm(4)
+    text = Calibration.of(identify(problem(true, 60, 0))).dump()
+    return true, parse_calibration(text, 'earlier.yaml', UR10E)
+
+
+def test_the_command_writes_the_calibration_brought_up_to_date(earlier, run, tmp_path):
+    true, previous = earlier
+    (tmp_path / 'earlier.yaml').write_text(previous.dump())
+    seen = problem(true.with_offsets({'elbow_joint.theta': 5e-4}), 8, 1).observations
+    write_csv(tmp_path / 'few.csv', rows_of(seen, 0))
+    given = ['identify', 'few.csv', '--chain', 'ur10e']
+    given += ['--sigma-position', '5e-5', '--sigma-orientation', '2e-4', '--previous']
+    status, said, _ = run(*given, 'earlier.yaml', '--out', 'out')
+    assert status == 0
+    assert 'elbow_joint.theta by +0.' in said
+    document = json.loads((tmp_path / 'out' / 'result.json').read_text())
+    assert document['changed'][0][0]['owner'] == 'elbow_joint'
+    text = (tmp_path / 'out' / 'calibration.yaml').read_text()
+    read = parse_calibration(text, 'c.yaml', UR10E)
+    assert read.record['previous']['table_sha256'] == previous.record['table_sha256']
+    assert read.record['table_sha256'] != previous.record['table_sha256']
+    assert read.chain.value('elbow_joint.theta') == pytest.approx(
+        previous.chain.value('elbow_joint.theta') + 5e-4, abs=1e-4
+    )
+    status, said, _ = run(*given, 'out', '--out', 'again')
+    assert status == 3
+    assert 'the calibration was fitted to these measurements' in ' '.join(said.split())
+    assert not (tmp_path / 'again' / 'calibration.yaml').exists()
+    status, _, told = run(*given, 'again')
+    assert (status, 'again/result.json says why' in told) == (1, True)
+    # over what it brings up to date, which is that of the next night too
+    assert run(*given, 'out', '--out', 'out', '--force')[0] == 3
+    assert (tmp_path / 'out' / 'calibration.yaml').read_text() == text
+    assert run(*given, 'out', '--out', 'out', '--force')[0] == 3
+    # over that of another robot
+    assert run(*given, 'out', '--out', 'again', '--force')[0] == 3
+    (tmp_path / 'again' / 'calibration.yaml').write_text('another')
+    assert run(*given, 'out', '--out', 'again', '--force')[0] == 3
+    assert (tmp_path / 'again' / 'calibration.previous.yaml').read_text() == 'another'
+    assert not (tmp_path / 'again' / 'calibration.yaml').exists()
+
+
+def test_the_calibration_of_another_serial_number_is_not_brought_up_to_date(
+    earlier, run, tmp_path
+):
+    true, previous = earlier
+    write_csv(tmp_path / 'few.csv', rows_of(problem(true, 8, 1).observations, 0))
+    (tmp_path / 'earlier.yaml').write_text(previous.dump())
+    given = ['identify', 'few.csv', '--chain', 'ur10e', '--sigma-position', '5e-5']
+    given += ['--sigma-orientation', '2e-4', '--previous']
+    assert run(*given, 'earlier.yaml', '--out', 'out', '--serial', '0042')[0] == 0  # none recorded
+    for serial in ('0043', '42'):
+        status, _, told = run(*given, 'out', '--serial', serial)
+        assert status == 1
+        assert f'serial "0042"; this one is "{serial}"' in told
