@@ -106,8 +106,10 @@ def filing_of(
     for name in (*OF_TABLES[1:], 'joints_preset'):  # a session is told apart anyway
         value = vars(options).get(name)  # the same table in other units is another result
         read += [f'{name} {value}'] if value and not isinstance(value, Path) else []
-    content = content_hash(read, options.session or '')
-    return Filing(options.serial, measured_at(sets, changed), content, settings, str(measured))
+    session = options.session or ''
+    source = f'{measured}#{session}' if session else str(measured)
+    content = content_hash(read, session)
+    return Filing(options.serial, measured_at(sets, changed), content, settings, source)
 
 
 def origin_of(

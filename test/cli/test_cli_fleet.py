@@ -17,6 +17,7 @@ from calib_ros.cli.common import Status
 from calib_ros.cli.main import main
 from calib_ros.files.history import History
 from calib_ros.fleet import run as running
+from calib_ros.fleet.plant import read_plant
 
 COMMON = ('--chain', 'ur10e', '--history', 'history', '--serial', '0042')
 
@@ -134,6 +135,20 @@ def test_programs_and_logs_through_pipes_make_other_results():
         main(['verify', 'poses.csv', '--joints', piped(log), *verify])
     rows = History('history').rows('0042')[3:]
     assert sorted(row.verdict for row in rows) == ['FAIL', 'PASS']
+
+
+def test_sessions_of_a_table_are_nights_of_their_own(folder):
+    """Without stamps both have the time of the table: one was taken for the other, put right."""
+    plants.write_plant(folder, ['0042'], 2)
+    nights = (pandas.read_csv(f'nights/0042/00{k}.csv').assign(session=k) for k in range(2))
+    pandas.concat(nights).drop(columns='stamp_ns').to_csv('both.csv', index=False)
+    for session in '01':
+        assert main(['identify', 'both.csv', '--session', session, *COMMON]) == 0
+    rows = History('history').rows('0042')
+    assert [row.source for row in rows] == ['both.csv#0', 'both.csv#1']
+    (robot,) = read_plant(Path('plant.yaml'))
+    own = [replace(row, settings=robot.settings_hash) for row in rows]
+    assert len(running.results(robot, own)) == 2
 
 
 def test_an_impatient_operator_ends_a_fleet_in_good_order(folder, monkeypatch, capsys):
