@@ -70,6 +70,15 @@ def years_since(record: Mapping[str, Any], sets: Sequence[Observations] = ()) ->
     return max(0.0, (new - then) / YEAR)
 
 
+def years_between(first: Mapping[str, Any], second: Mapping[str, Any]) -> float:
+    """Return the time [years] between two calibrations by their records; 0 if not known."""
+    for key in ('measured', 'created'):
+        one, other = _time_in(first, key), _time_in(second, key)
+        if one is not None and other is not None:
+            return abs(one - other) / YEAR
+    return 0.0
+
+
 def _time_in(record: Mapping[str, Any], key: str) -> datetime | None:
     with suppress(ValueError):
         time = datetime.fromisoformat(str(record.get(key)))

@@ -10,7 +10,8 @@ quadratic form of d; its limit is the quantile for d ~ N(d, C).
 
 Wobble of the axes that the models lack moves the parameters of each, in a small region without a
 trace in the residuals (`unmodelled.py`). It is the same in both, so C has the covariance of the
-difference of its effects: nothing for the same poses, the whole for other regions.
+difference of its effects: nothing for the same poses, the whole for other regions. The usual
+drift (`age.py`) between both is no change either.
 
 Smooth errors of a moved device (`considered.py`) give differences if other poses were measured.
 Only expected squares of errors include them (`region.py`): a difference that is significant
@@ -37,6 +38,7 @@ from calib_ros.estimation.levels import CONFIDENT, SEVERAL, chance_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.start import fit_to_arm
+from calib_ros.identification.age import drift_of, years_between
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
@@ -186,8 +188,9 @@ def _squares(
             whole = own + _in_names(region.chain, names, region.names, device)
         square += own
         lacking += whole
-    wobble = size**2 * apart @ apart.T
-    return square + wobble, lacking + wobble
+    years = years_between(*(each.record for each in pair))
+    more = size**2 * apart @ apart.T + years * np.diag(drift_of(names))
+    return square + more, lacking + more
 
 
 def _in_parameters_of(

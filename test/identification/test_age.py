@@ -11,7 +11,7 @@ from fits import UR10E, arm, problem
 
 from calib_ros import Calibration, identify, recalibrate
 from calib_ros.errors import InputError
-from calib_ros.identification.age import YEAR, measured_at, years_since
+from calib_ros.identification.age import YEAR, measured_at, years_between, years_since
 from calib_ros.identification.calibration import parse_calibration
 
 BEGIN = datetime(2025, 3, 1, 22, 0, tzinfo=timezone.utc)
@@ -57,6 +57,15 @@ def test_without_times_the_clock_tells_the_age():
     set_back = {'created': (now + timedelta(days=400)).isoformat()}
     unknown = ({}, {'created': 'today'}, {'created': '2020-01-01T00:00:00'}, set_back)
     assert [years_since(each) for each in unknown] == [1.0] * 4
+
+
+def test_the_time_between_two_calibrations_is_that_between_their_poses():
+    earlier = {'measured': '2025-03-01T22:00:00+00:00', 'created': '2026-03-01T22:00:00+00:00'}
+    later = {'measured': '2025-03-02T22:00:00+00:00', 'created': '2026-03-01T23:00:00+00:00'}
+    assert years_between(earlier, later) == years_between(later, earlier) == 1.0 / 365.25
+    hour = years_between(earlier, {**later, 'measured': None})
+    assert hour == pytest.approx(1.0 / 24.0 / 365.25)
+    assert years_between(earlier, {}) == 0.0
 
 
 def test_poses_older_than_those_of_the_calibration_are_refused(earlier):

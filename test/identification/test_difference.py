@@ -20,6 +20,7 @@ from calib_ros.decision.changes import (
     reasons_of,
 )
 from calib_ros.errors import InputError
+from calib_ros.identification.age import drift_of
 from calib_ros.kinematics.parameter import Parameter
 
 UR10 = DATA / 'ur10_ipa_leica'
@@ -39,6 +40,23 @@ def nights():
     """Return an arm, and its calibration."""
     true = faulty(UR, Cell(), np.random.default_rng(3))
     return true, calibrated(true, 0)
+
+
+def test_the_usual_drift_of_a_year_is_no_change_and_hides_no_bump(nights):
+    true, first = nights
+    first = replace(first, record={**first.record, 'measured': '2025-01-01T00:00:00+00:00'})
+    names = [Parameter(n) for n in first.names if not UR.owns_frame(n)]
+    size = np.sqrt(drift_of(names))
+    for seed in range(3):
+        drift = size * np.random.default_rng(seed).normal(size=len(names))
+        later = true.with_offsets(dict(zip(names, drift, strict=True)))
+        told = []
+        for now in (later, later.with_offsets({'elbow_joint.theta': 5e-4})):
+            second = calibrated(now, seed)
+            record = {**second.record, 'measured': '2026-01-01T00:00:00+00:00'}
+            told.append(difference(first, replace(second, record=record)))
+        assert told[0].same
+        assert [each[0].owner for each in told[1].changed] == ['elbow_joint']
 
 
 def elsewhere(true):
