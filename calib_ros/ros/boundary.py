@@ -14,6 +14,7 @@ import threading
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import rclpy
@@ -21,8 +22,10 @@ from rclpy.exceptions import InvalidHandle, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
+from rclpy.waitable import NumberOfEntities, Waitable
 from std_srvs.srv import Trigger
 
 from calib_ros.errors import CalibrationError, trouble
@@ -82,12 +85,58 @@ class Boundary:
         self._logger.error(f'internal error: {traceback.format_exc()}')
 
 
+class InOrder(Waitable):  # type: ignore[misc]  # see pyproject.toml
+    """The services of a node, answered in the order of the calls.
+
+    Jazzy's executors answer the calls that wait in the order in which the services were created:
+    a ~/clear overtook the ~/identify before it.
+    """
+
+    def __init__(self, node: Node) -> None:
+        super().__init__(node.default_callback_group)
+        self._services: list[Service] = list(node.services)
+        self._places: list[int] = []  # in the wait set
+        node.add_waitable(self)
+
+    def __contains__(self, service: object) -> bool:
+        """Tell whether a service is one of these, not to be served by the executor."""
+        return service in self._services
+
+    def get_num_entities(self) -> NumberOfEntities:
+        """Return what it adds to a wait set."""
+        return NumberOfEntities(num_services=len(self._services))
+
+    def add_to_wait_set(self, wait_set: Any) -> None:
+        """Wait for calls."""
+        self._places = [wait_set.add_service(each.handle) for each in self._services]
+
+    def is_ready(self, wait_set: Any) -> bool:
+        """Tell whether calls wait."""
+        return any(wait_set.is_ready('service', place) for place in self._places)
+
+    def take_data(self) -> list[tuple[int, Service, Any, Any]]:
+        """Return the calls that wait, in the order in which they came."""
+        come = []
+        for service in self._services:
+            with service.handle:
+                take = partial(service.handle.service_take_request, service.srv_type.Request)
+                for request, header in iter(take, (None, None)):
+                    come.append((header.received_timestamp, service, request, header))
+        return sorted(come, key=itemgetter(0))
+
+    async def execute(self, taken_data: list[tuple[int, Service, Any, Any]]) -> None:
+        """Answer calls."""
+        for _, service, request, header in taken_data:
+            response = service.callback(request, service.srv_type.Response())
+            service.send_response(response, header)
+
+
 class DeferredTrigger:
     """A Trigger service whose work runs on a separate thread.
 
-    Jazzy's executors send the answer through the service's `send_response` right after the
-    callback, on the same thread. It is replaced here by one that holds the answer back until the
-    work has ended. An async callback starves the node's timers in rclpy's single-threaded
+    The answer is sent through the service's `send_response` right after the callback, on the same
+    thread. It is replaced here by one that holds the answer back until the work has ended. An
+    async callback starves the node's timers in rclpy's single-threaded
     executor. Several threads, one for each such service and one for the rest, would need a lock
     around the session, and cost an idle node 13 % more. A call during the work is refused at once.
 
@@ -200,7 +249,7 @@ def run_node(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
 def _spin(node: Any, executor: SingleThreadedExecutor, stop: threading.Event) -> None:
     while not stop.is_set() and rclpy.ok():
         executor.spin_once(timeout_sec=0.1)
-    for _ in (*node.services, *node.timers):  # calls that came before the end are answered
+    for _ in (*node.waitables, *node.timers):  # calls that came before the end are answered
         executor.spin_once(timeout_sec=0.0)
 
 

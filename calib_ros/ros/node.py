@@ -21,6 +21,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.time_source import CLOCK_TOPIC
 from rclpy.waitable import Waitable
@@ -42,7 +43,7 @@ from calib_ros.identification.recalibration import recalibrate
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import documents, words
 from calib_ros.ros.advisor import Guide
-from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, run_node
+from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, InOrder, run_node
 from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.identifying import Filer, Identifying
 from calib_ros.ros.inputs import Inputs, deserialised
@@ -116,6 +117,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             self, self.session, self._archive, self._inputs, self._boundary, given.serial
         )
         self._working = self._serve()
+        self._calls = InOrder(self)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time may stop and jump
         timed = (DIAGNOSTICS_PERIOD, self._on_second), (TAKING_PERIOD, self._on_tick)
         for period, work in timed:
@@ -212,6 +214,12 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         """Return the waitables that an executor serves, without those of the inputs."""
         inputs = getattr(self, '_inputs', ())
         return (each for each in super().waitables if each not in inputs)
+
+    @property
+    def services(self) -> Iterator[Service]:
+        """Return the services that an executor serves, without those answered in order."""
+        calls = getattr(self, '_calls', ())
+        return (each for each in super().services if each not in calls)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., None], *args: Any, **more: Any

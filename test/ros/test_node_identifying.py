@@ -6,12 +6,16 @@ import queue
 import threading
 
 import pytest
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from ros_cell import PATIENCE, STOPS, Cell, topics
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from calib_ros.files import loading
 from calib_ros.files.history import History
 from calib_ros.identification.identification import identify
+from calib_ros.ros.arguments import NODE
 
 
 @pytest.fixture
@@ -193,3 +197,32 @@ def test_what_is_called_at_last_holds(cell, recording, held, call):
     cell.play(topics(recording))
     judged = cell.call('validate')
     assert f'{STOPS} poses measured since' in judged.message
+
+
+@pytest.mark.parametrize(
+    'calls',
+    [
+        {'identify': 'accepted: 24 poses', 'clear': '24 poses cleared'},
+        {'identify': 'accepted: 24 poses', 'remove_last': '24 removed', 'clear': '23 poses'},
+        {'clear': '22 poses cleared', 'identify': 'no poses to fit'},
+        {'identify': 'accepted: 24 poses', 'set_parameters': ''},
+        {'set_parameters': '', 'identify': 'NOT accepted'},
+    ],
+)
+def test_calls_that_wait_are_answered_in_order(cell, recording, calls):
+    """~/clear overtook the ~/identify before it, which then had no poses."""
+    cell.play(topics(recording))
+    changes = Parameter('largest_error', value=1e-6).to_parameter_msg()
+    requests = {'set_parameters': SetParameters.Request(parameters=[changes])}
+    clients = [
+        cell.peer.create_client(SetParameters if name in requests else Trigger, f'{NODE}/{name}')
+        for name in calls
+    ]
+    cell.spin_until(lambda: all(client.service_is_ready() for client in clients))
+    answers = [
+        client.call_async(requests.get(name, Trigger.Request()))
+        for name, client in zip(calls, clients, strict=True)
+    ]
+    cell.spin_until(lambda: all(answer.done() for answer in answers))
+    for said, answer in zip(calls.values(), answers, strict=True):
+        assert said in getattr(answer.result(), 'message', '')
