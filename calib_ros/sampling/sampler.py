@@ -52,6 +52,7 @@ class Sampler:
         self._shaken = math.inf  # the number of that stop
         self.dropped: Counter[str] = Counter()
         self.rested = self.restless = 0  # stops with measurements at rest, and not
+        self.doubled: list[float] = []  # spreads [m] of those in two places by turns
 
     def samples(
         self,
@@ -94,6 +95,7 @@ class Sampler:
                 self.restless += 1
                 continue
             self.rested += 1
+            self.doubled += means.spreads[k : k + means.doubled[k]].tolist()
             rows = values[begin : begin + count]
             if left_out:
                 self.dropped[VIBRATING] += left_out

@@ -1,13 +1,16 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import itertools
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from sessions import SIGMAS, UR5E, drive, samples, session, tracker
+from fits import NOISE
+from sessions import SIGMAS, TRUE, UR5E, drive, samples, session, tracker
 from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, take
 
+from calib_ros.apply.simulation import measure
 from calib_ros.errors import InputError
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
@@ -38,6 +41,26 @@ def test_measurements_of_two_places_are_told(spread, size, told):
     assert ('stops scatter by 20 mm: do two devices or targets' in made.status()) == told
     assert made.doubtful or not told
     assert len(made.warnings) == told
+
+
+@pytest.mark.parametrize(
+    ('apart', 'noise', 'told'),
+    [(1e-3, 0.0, '0.29'), (2e-2, 1e-3, '5.8'), (1e-4, 0.0, ''), (0.0, 1e-3, ''), (2e-3, 5e-4, '')],
+)
+def test_two_devices_close_together_are_told_by_their_turns(apart, noise, told):
+    """Less than 35 mm apart they were averaged and accepted without a word."""
+    made, rng, turns = CalibrationSession(UR5E), np.random.default_rng(7), itertools.count()
+
+    def message(stamp, row):
+        found = measure(TRUE, row[np.newaxis], rng, *NOISE)
+        where = found.positions[0] + [0.0, 0.0, (next(turns) % 2) * apart]
+        return pose(stamp, where + rng.normal(scale=noise, size=3), found.rotations[0])
+
+    drive(made, 30, [(TRACKER, POSE, message)])
+    made.finish()
+    assert len(made.samples) == 30
+    assert ('two devices or targets' in made.status()) == bool(told)
+    assert f'measurements at 30 stops scatter by {told} mm' in made.summary or not told
 
 
 def test_the_status_tells_how_far_it_is():
