@@ -76,11 +76,6 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         found = _identified(options, screen)
         if options.out is not None:
             contents |= result_files(found, screen, options.out, options.pdf)
-    if filed is not None:
-        (history, unread), problem = filed, found.loaded.problem
-        judged_by = options.largest_loss
-        about = inputs.filing_of(options, problem.chain, problem.all_sets, unread, judged_by)
-        history.file(row_of(found.result, about, found.loaded.warnings))
     shown = () if found.result.accepted and not options.json else words.other_remarks(found.result)
     for warning in (*found.loaded.warnings, *shown):
         screen.warn(warning)
@@ -92,6 +87,11 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             screen.bullet('nothing was saved: --out FOLDER writes the calibration and its report')
         else:
             screen.say(common.written(options.out, contents))
+    if filed is not None:  # last: a full disk there must not hide the result
+        (history, unread), problem = filed, found.loaded.problem
+        judged_by = options.largest_loss
+        about = inputs.filing_of(options, problem.chain, problem.all_sets, unread, judged_by)
+        history.file(row_of(found.result, about, found.loaded.warnings))
     return 0 if found.result.accepted else common.Status.NOT_ACCEPTED
 
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from calib_ros.apply.verification import Verification, verify
@@ -44,13 +44,17 @@ EARLIER_FILES = ('verification.txt',)  # of earlier versions: no verdict stays b
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     screen.quiet = screen.quiet or options.json
     with common.output_files(options, (*VERIFICATION_FILES, *EARLIER_FILES)) as contents:
-        status = _verified(options, screen, contents)
+        status, file = _verified(options, screen, contents)
     if options.out is not None:
         screen.say(common.written(options.out, contents))
+    file()  # last: a full disk there must not hide the verdict
     return status
 
 
-def _verified(options: argparse.Namespace, screen: Screen, contents: common.Contents) -> int:
+def _verified(
+    options: argparse.Namespace, screen: Screen, contents: common.Contents
+) -> tuple[int, Callable[[], object]]:
+    """Print a verdict and add its files; return the status, and what files it in the history."""
     filed = inputs.history_of(options)
     nominal = load_chain(options.chain)
     arm = inputs.calibration_of(options.calibration, 'verify --calibration', nominal)
@@ -61,12 +65,15 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     confidence, moved = options.confidence, (options.new_base, options.new_tool)
     with screen.work('judging') as work:
         found = verify(arm, sets, tolerance, confidence, moved[0], commanded, moved[1], work)
-    if filed is not None:
-        history, unread = filed
-        wanted = None if commanded is None else commanded.tolist()
-        judged_by = (table_hash(arm.chain), options.tolerance, confidence, *moved, wanted)
-        about = inputs.filing_of(options, nominal, sets, unread, *judged_by)
-        history.file(verified(arm.chain, found, about))
+
+    def file() -> None:
+        if filed is not None:
+            history, unread = filed
+            wanted = None if commanded is None else commanded.tolist()
+            judged_by = (table_hash(arm.chain), options.tolerance, confidence, *moved, wanted)
+            about = inputs.filing_of(options, nominal, sets, unread, *judged_by)
+            history.file(verified(arm.chain, found, about))
+
     for warning in warnings:
         screen.warn(warning)
     if options.json:
@@ -76,7 +83,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     passed = standing(found)[0].state not in ('bad', 'open')
     status = 0 if passed else common.Status.NOT_ACCEPTED
     if options.out is None:
-        return status
+        return status, file
     read = (options.measured, options.commanded, calibration_file(options.calibration))
     with screen.work('writing the report') as work:
         poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
@@ -85,7 +92,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
         contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
         contents['report.md'] = markdown(report, {})
         contents |= inputs.page_of(report, screen, pdf=options.pdf)
-    return status
+    return status, file
 
 
 def show(found: Verification, screen: Screen) -> None:

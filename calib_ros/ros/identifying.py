@@ -17,7 +17,7 @@ from visualization_msgs.msg import MarkerArray
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
-from calib_ros.errors import LONGEST, ConfigError, InputError, shortened
+from calib_ros.errors import LONGEST, ConfigError, InputError, shortened, trouble
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.history import History
@@ -73,7 +73,7 @@ class Filer:
                 about = Filing(self.serial, measured_at(sets), samples_hash(sets), hashed)
                 self._history.file(row(about))
         except Exception as err:  # of the network too: the result is told all the same
-            return f'{NOT_FILED} in the history: {err}'
+            return f'{NOT_FILED} in the history: {trouble(err)}'
         return ''
 
 
@@ -192,7 +192,9 @@ class Identifying:
             text = page()
             self._report = (text and self._archive.note(text, '.html')) or None
         except Exception as err:  # the answer is sent without the page
-            self._node.get_logger().warning(f'the report of the refusal is not written: {err}')
+            self._node.get_logger().warning(
+                f'the report of the refusal is not written: {trouble(err)}'
+            )
         if self._report:
             self.last += f'; report: {self._report}'
 

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray, String
 
 from calib_ros.atomic import confined, given_path, write_file
-from calib_ros.errors import InputError
+from calib_ros.errors import InputError, trouble
 from calib_ros.files.archive import Archive
 from calib_ros.files.export import exports, urdf_export
 from calib_ros.files.vendors import vendor_files
@@ -110,7 +110,7 @@ class Keeper:
                 write_file(report, page)
                 written.append(report)
         except Exception as err:  # the calibration is saved without the page
-            self._node.get_logger().warning(f'the report of {path} is not written: {err}')
+            self._node.get_logger().warning(f'the report of {path} is not written: {trouble(err)}')
         return written
 
     def at_start(self) -> tuple[Path | None, bool]:

@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import errno
 import hashlib
 import json
 import os
@@ -42,6 +43,26 @@ def piped(text):
     os.write(begin, text)
     os.close(begin)
     return f'/dev/fd/{end}'
+
+
+@pytest.mark.parametrize('command', ['identify', 'verify'])
+def test_a_result_is_told_and_written_although_its_history_is_full(
+    calibrated, monkeypatch, capsys, command
+):
+    """The verdict was lost with the row, and the report of verify too."""
+
+    def fail(history, row):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), 'history')
+
+    monkeypatch.setattr(History, 'file', fail)
+    more = [] if command == 'identify' else ['--calibration', 'result']
+    capsys.readouterr()
+    assert main([command, 'nights/0042/001.csv', *COMMON, *more, '--out', 'new']) == 1
+    out, err = capsys.readouterr()
+    assert 'position error' in out
+    assert Path('new/report.html').exists()
+    (line,) = err.strip().splitlines()[-1:]
+    assert line == 'calib_ros: history: the disk is full: make room, or write to another place'
 
 
 def test_identify_and_verify_are_filed(calibrated, capsys):

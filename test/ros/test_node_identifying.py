@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real node in real rclpy: an identification that runs."""
 
+import errno
 import queue
 import threading
 
@@ -89,17 +90,26 @@ def test_messages_are_taken_while_a_judgement_is_filed(tmp_path, recording, monk
         assert [row.kind for row in rows] == ['validate']
 
 
-def test_a_result_is_told_although_its_history_fails(tmp_path, recording, monkeypatch):
+@pytest.mark.parametrize(
+    ('error', 'said'),
+    [
+        (ZeroDivisionError('no credentials'), 'no credentials'),
+        (OSError(errno.ENOSPC, 'No space left', 'rows'), 'rows: the disk is full: make room'),
+    ],
+)
+def test_a_result_is_told_although_its_history_fails(
+    tmp_path, recording, monkeypatch, error, said
+):
     """Clients of remote storage raise errors of their own: an accepted result seemed refused."""
 
     def fail(history, row):
-        raise ZeroDivisionError('no credentials')
+        raise error
 
     monkeypatch.setattr(History, 'file', fail)
     parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': '7'}
     with Cell(**parameters, history=str(tmp_path / 'history')) as cell:
         cell.play(topics(recording))
-        assert 'no credentials' in cell.in_full(cell.done('identify'))
+        assert f'history: {said}' in cell.in_full(cell.done('identify'))
 
 
 STAGES = ['model geometric', 'effects', 'effects: ratio', 'harmonics of elbow_joint']
