@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoding of serialised messages of a recording straight to arrays.
 
-Messages of one topic mostly differ only in stamps and numbers: the names, and so the offsets of
-the numbers (OMG Common Data Representation), are the same. The layout is derived from the first
-message, others of its length are compared with it byte by byte, and all numbers are read at once.
+Messages of one topic mostly differ only in stamps and numbers: the names, or at least their
+lengths, and so the offsets of the numbers (OMG Common Data Representation), are the same. The
+layout is derived from the first message, others of its length are compared with it byte by byte,
+and all numbers are read at once, and then divided by names.
 """
 
 from __future__ import annotations
@@ -28,45 +29,72 @@ BYTE_ORDERS = {b'\x00\x01': '<', b'\x00\x00': '>'}
 _HEAD = struct.calcsize('2s2s')  # encoding and options
 
 
+Strings: TypeAlias = 'tuple[tuple[str, ...], ...]'
+"""Those of each part of a message."""
+Groups: TypeAlias = 'list[tuple[Index | slice, Strings]]'
+"""Indices of messages with the same strings, and these."""
+
+
 @dataclass(frozen=True, eq=False)
 class MessageLayout:
-    """The K parts of messages of one kind: their strings, and where their numbers are.
+    """The K parts of messages of one kind: where their strings and their numbers are.
 
-    Places count words of the size of a number, or of four bytes of a stamp, from the head.
+    Places count words of the size of a number, or of four bytes of a stamp, from the head; those
+    of strings, and of their bytes and lengths, count bytes.
     """
 
-    strings: tuple[tuple[str, ...], ...]
+    strings: Strings  # of the first message
+    places: tuple[tuple[slice, ...], ...]  # of these, with the zero at the end
     stamps: Index  # (K, 2) places of seconds and nanoseconds
     kind: str  # of the numbers, with the order of bytes
     numbers: Index  # (K, w) places
-    begin: int  # offset of the first common byte
-    text: NDArray[np.uint8]  # the common bytes
-    mask: NDArray[np.uint8]  # 255 for common bytes
-    last: slice  # the last block of these
-
-    def among(self, rows: NDArray[np.uint8]) -> Flags:
-        """Tell which messages (N, ...) have this layout."""
-        part = slice(self.begin, len(self.mask))
-        alone = len(self.strings) == 1  # usually even the bytes between are alike: half the cost
-        if alone and (rows[:, part] == self.text[part]).all():
-            return np.ones(len(rows), dtype=bool)
-        equal = (rows[:, self.last] == self.text[self.last]).all(axis=1)  # usually decides
-        equal[equal] = ~((rows[equal, part] ^ self.text[part]) & self.mask[part]).any(axis=1)
-        return np.asarray(equal)
+    lengths: Index  # (L,) places
+    named: Index  # (M,) places
+    text: NDArray[np.uint8]  # the first message
+    common: slice  # what the strings and lengths span
 
     def read(
         self, rows: NDArray[np.uint8]
-    ) -> Iterator[tuple[tuple[str, ...], Stamps, FloatArray]]:
-        """Yield the strings, stamps (N,) and numbers (N, w) of each part of messages (N, ...)."""
-        length = rows.shape[1] - _HEAD
-        whole = slice(_HEAD, _HEAD + length - length % int(self.kind[2:]))
-        order, words = self.kind[0], np.ascontiguousarray(rows[:, whole])
-        words = words.view(f'{order}i4')
+    ) -> tuple[Flags, list[tuple[Index | slice, tuple[str, ...], Stamps, FloatArray]]]:
+        """Return which messages (N, ...) have this layout, and what they hold.
+
+        Indices (G,) among these, the strings, stamps (G,) and numbers (G, w) of a part.
+        """
+        same = np.ones(len(rows), dtype=bool)
+        groups: Groups = [(slice(None), self.strings)]  # usually
+        if len(self.strings) > 1 or (rows[:, self.common] != self.text[self.common]).any():
+            same = (rows.take(self.lengths, axis=1) == self.text[self.lengths]).all(axis=1)
+            rows = rows if same.all() else rows[same]
+            groups = self._by_names(rows)
+        length, size = rows.shape[1] - _HEAD, int(self.kind[2:])
+        words = np.ascontiguousarray(rows[:, _HEAD : _HEAD + length - length % size])
+        order, words = self.kind[0], words.view(f'{self.kind[0]}i4')
         times = words.take(self.stamps, axis=1)  # nanoseconds are without sign
         stamps = times[..., 0].astype(np.int64) * 1_000_000_000 + times.view(f'{order}u4')[..., 1]
         numbers = words.view(self.kind).take(self.numbers, axis=1).astype(float, copy=False)
-        for k, strings in enumerate(self.strings):
-            yield strings, stamps[:, k], numbers[:, k]
+        return same, [
+            (which, names, stamps[which, k], numbers[which, k])
+            for which, strings in groups
+            for k, names in enumerate(strings)
+        ]
+
+    def _by_names(self, rows: NDArray[np.uint8]) -> Groups:
+        """Return the messages (N, ...) with the same strings, and these; not damaged ones."""
+        texts = rows.take(self.named, axis=1)
+        if (texts == self.text[self.named]).all():
+            return [(slice(None), self.strings)]
+        whole = texts.view(f'V{texts.shape[1]}').ravel()
+        _, group, counts = np.unique(whole, return_inverse=True, return_counts=True)
+        members = np.split(np.argsort(group, kind='stable'), np.cumsum(counts)[:-1])
+        found: Groups = []
+        for which in sorted(members, key=lambda each: int(each[0])):
+            row = rows[which[0]].tobytes()
+            with suppress(UnicodeDecodeError):
+                strings = tuple(
+                    tuple(row[at][:-1].decode() for at in each) for each in self.places
+                )
+                found.append((which, strings))
+        return found
 
 
 Layouts: TypeAlias = dict[tuple[int, bytes], list[MessageLayout]]
@@ -100,14 +128,13 @@ def alike(
             if len(layouts) == MOST_NAMES:
                 layouts.clear()
             layouts.append(layout)
-        some = rest if tried < MOST_NAMES else rest[:1]  # of so many names, each by itself
+        some = rest if tried < MOST_NAMES else rest[:1]  # of so many layouts, each by itself
         tried += 1
-        left = rows if len(some) == len(rows) else rows[some]
-        equal = layout.among(left)
-        if equal.any():
-            for part in layout.read(left if equal.all() else left[equal]):
-                yield some[equal], *part
-        rest = np.concatenate([some[~equal], rest[len(some) :]])
+        same, found = layout.read(rows if len(some) == len(rows) else rows[some])
+        own = some[same]
+        for which, strings, stamps, numbers in found if len(own) else ():
+            yield own[which], strings, stamps, numbers
+        rest = np.concatenate([some[~same], rest[len(some) :]])
 
 
 def message_layout(kind: str, blob: bytes) -> MessageLayout:
@@ -116,7 +143,7 @@ def message_layout(kind: str, blob: bytes) -> MessageLayout:
         raise struct.error('it is not in CDR')
     texts, between, numbers, count = FORMS[kind]
     read, size = _Reader(blob), int(numbers[1:])
-    parts, begins = list[tuple[str, ...]](), list[tuple[int, int]]()
+    parts, at, begins = list[tuple[str, ...]](), list[tuple[slice, ...]](), list[tuple[int, int]]()
     for _ in range(read.count() if kind == TRANSFORMS else 1):
         stamp = _aligned(read.at, 4)
         read.at = stamp + 8
@@ -131,31 +158,34 @@ def message_layout(kind: str, blob: bytes) -> MessageLayout:
         if read.at > len(blob):
             raise struct.error('it is cut off')
         parts.append(tuple(strings))
+        at.append(tuple(read.texts[-len(strings) :]))
         begins.append((stamp, begin))
-    mask = np.zeros(read.named[-1].stop, dtype=np.uint8)
-    for part in read.named:
-        mask[part] = 255
-    text = np.frombuffer(blob, dtype=np.uint8)[: len(mask)]
+    mask = np.zeros(len(blob), dtype=bool)
+    for each in read.texts:
+        mask[each] = True
+    lengths = np.add.outer(read.lengths, np.arange(4)).ravel()
     places = np.array(begins, dtype=np.intp).reshape(-1, 2) - _HEAD
     return MessageLayout(
         tuple(parts),
+        tuple(at),
         places[:, :1] // 4 + np.arange(2),
         BYTE_ORDERS[blob[:2]] + numbers,
         places[:, 1:] // size + np.arange(count),
-        read.named[0].start,
-        text,
-        mask,
-        read.named[-1],
+        lengths,
+        np.flatnonzero(mask),
+        np.frombuffer(blob, dtype=np.uint8),
+        slice(lengths[0], max(lengths[-1] + 1, read.texts[-1].stop if read.texts else 0)),
     )
 
 
 class _Reader:
-    """Reader of the names in a message from offset `at`; `named` are their slices."""
+    """Reader of the names in a message from offset `at`; `texts` are their slices."""
 
     def __init__(self, blob: bytes) -> None:
         self._blob, self._order = blob, BYTE_ORDERS.get(blob[:2], '>')
         self.at = _HEAD
-        self.named: list[slice] = []
+        self.texts: list[slice] = []
+        self.lengths: list[int] = []  # and counts: their offsets
 
     def stamp(self) -> int:
         seconds, nanoseconds = struct.unpack_from(f'{self._order}iI', self._blob, self.at)
@@ -167,7 +197,7 @@ class _Reader:
         self.at = begin + 4
         if self.at > len(self._blob):
             raise struct.error('it is cut off')
-        self.named.append(slice(begin, self.at))
+        self.lengths.append(begin)
         return int(struct.unpack_from(f'{self._order}I', self._blob, begin)[0])
 
     def count(self) -> int:
@@ -181,7 +211,7 @@ class _Reader:
         """Return a zero-terminated text."""
         length = self.integer()
         begin, self.at = self.at, self.at + length
-        self.named[-1] = slice(begin - 4, self.at)
+        self.texts.append(slice(begin, self.at))
         return self._blob[begin : begin + max(length - 1, 0)].decode()
 
 
