@@ -1,21 +1,31 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of the arguments of public functions, and of fields, by their annotations."""
+"""Checks of the arguments of public functions, and of fields, by their annotations.
+
+Numbers may be annotated with a test, and with the words for what passes it.
+"""
 
 from __future__ import annotations
 
 import inspect
+import math
 import re
 import typing
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from numbers import Integral, Real
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar, get_args, get_origin
 
 from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
 
+Positive: TypeAlias = Annotated[float, lambda x: 0.0 < x < math.inf, 'a positive number']
+NotNegative: TypeAlias = Annotated[float, lambda x: 0.0 <= x < math.inf, 'a number of at least 0']
+Share: TypeAlias = Annotated[float, lambda x: 0.0 < x < 1.0, 'between 0 and 1, as 0.95']
+Fraction: TypeAlias = Annotated[float, lambda x: 0.0 <= x < 1.0, 'from 0 to 1']
+Count: TypeAlias = Annotated[int, lambda x: x >= 1, 'at least 1']
+Several: TypeAlias = Annotated[int, lambda x: x >= 2, 'at least 2']
 _F = TypeVar('_F', bound=Callable[..., Any])
 _FLAGS = ('bool', 'bool_')  # of Python, and of both generations of numpy
 _QUOTED = (str, Real, NoneType, tuple, list)
@@ -25,7 +35,9 @@ _TESTS: dict[Any, Callable[[Any], bool]] = {
     Any: lambda x: True,
     int: lambda x: isinstance(x, Integral) and type(x).__name__ not in _FLAGS,
 }
-_hints: Callable[[Any], dict[str, Any]] = cache(typing.get_type_hints)
+_hints: Callable[[Any], dict[str, Any]] = cache(
+    partial(typing.get_type_hints, include_extras=True)
+)
 
 
 def as_annotated(function: _F) -> _F:
@@ -60,6 +72,8 @@ def check_fields(made: Any) -> None:
 def _fitting(value: Any, hint: Any, name: str, finite: bool) -> Any:
     """Return a value as annotated; the ConfigError or InputError for another one has its name."""
     kind, parts = get_origin(hint) or hint, get_args(hint)
+    if kind is Annotated:
+        return _passing(_fitting(value, parts[0], name, finite), name, *parts[1:])
     if kind in (typing.Union, UnionType):
         if len(parts) == 2 and value is not None and parts[1] is NoneType:
             return _fitting(value, parts[0], name, finite)
@@ -93,6 +107,12 @@ def _fitting(value: Any, hint: Any, name: str, finite: bool) -> Any:
     made = ' (Calibration.of(result))' if wanted == 'Calibration' else ''
     shown = f'{value!r:.60}' if isinstance(value, _QUOTED) else type(value).__name__
     raise ConfigError(f'{name} must be of type {wanted}{made}, not {shown}')
+
+
+def _passing(value: Any, name: str, test: Callable[[Any], bool], words: str) -> Any:
+    if test(value):
+        return value
+    raise ConfigError(f'{name} must be {words}, not {value}')
 
 
 def _is_list(value: object) -> bool:

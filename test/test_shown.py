@@ -29,6 +29,7 @@ RESULT = calib_ros.identify(PROBLEM)
 ARM = calib_ros.Calibration.of(RESULT)
 DESIGN = Design.of(PROBLEM)
 PLANNED = {'candidates': JOINTS[:40], 'task': JOINTS[:5], 'count': 8, 'draws': 2}
+PLAN = partial(plan, DESIGN, **PLANNED | {'count': 3})
 CORRECTED = calib_ros.Compensator(CHAIN, ARM.chain)
 NOT_NUMBERS = (JOINTS > 0.0, JOINTS + 1j, JOINTS.astype('datetime64[s]'), JOINTS.astype(str), 'a')
 VALUES = (CHAIN, SEEN, PROBLEM, RESULT, ARM, RESULT.posterior)
@@ -75,6 +76,63 @@ def test_a_value_fits_on_a_screen(value):
     ],
 )
 def test_arguments_of_another_type_are_named(call, said):
+    with pytest.raises(calib_ros.CalibrationError, match=said):
+        call()
+
+
+@pytest.mark.parametrize(
+    ('call', 'said'),
+    [
+        *(
+            (partial(calib_ros.Problem, CHAIN, SEEN, **{name: value}), f'{name} must be {what}')
+            for name, value, what in (
+                ('largest_length', -1.0, 'a number of at least 0, not -1.0'),
+                ('largest_angle', -1.0, 'a number of at least 0'),
+                ('largest_error', np.nan, 'of type float, not nan'),
+                ('sigma_position', 0.0, 'a positive number, not 0.0'),
+                ('sigma_touch', np.inf, 'a positive number'),
+                ('sigma_scale', 1.0, 'from 0 to 1, not 1.0'),
+                ('folds', 1, 'at least 2, not 1'),
+            )
+        ),
+        (
+            partial(calib_ros.Problem, CHAIN, SEEN, priors={'*.a': 0}),
+            r"priors\['\*.a'\] must be a p",
+        ),
+        (partial(calib_ros.recalibrate, ARM, PROBLEM, -1.0), 'years must be a number of at least'),
+        (partial(calib_ros.recalibrate, ARM, PROBLEM, np.inf), 'years must be a number of at'),
+        (
+            partial(calib_ros.recalibrate, ARM, PROBLEM, 1.0, -1e-5),
+            'growth must be a number of at',
+        ),
+        (partial(PLAN, apart=-1.0), 'apart must be a number of at least 0, not -1.0'),
+        (partial(PLAN, count=0), 'count must be at least 1, not 0'),
+        (partial(PLAN, draws=0), 'draws must be at least 1, not 0'),
+        (
+            partial(PLAN, chosen=[1, 2, 100]),
+            'chosen must be 3 numbers from 0 to 39, not .1, 2, 100',
+        ),
+        (partial(PLAN, chosen=[1, 2, -1]), 'chosen must be 3 numbers from 0 to 39'),
+        (partial(PLAN, chosen=[1, 2]), 'chosen must be 3 numbers from 0 to 39'),
+        (partial(calib_ros.verify, ARM, [SEEN], 0.0), 'tolerance must be a positive number'),
+        (partial(calib_ros.read_table, 'a.csv', -1), 'joints must be at least 1, not -1'),
+        (
+            partial(calib_ros.read_table, 'a.csv', 6, sigmas=(1e-4, -1.0)),
+            r'sigmas\[1\] must be a positive number, not -1.0',
+        ),
+        (
+            partial(RESULT.confidence_ellipsoid, np.zeros((1, 6)), 'a'),
+            'level must be of type float',
+        ),
+        (
+            partial(RESULT.confidence_ellipsoid, np.zeros((1, 6)), 1.0),
+            'level must be between 0 and',
+        ),
+        (partial(RESULT.predicted_sigma, 0), 'count must be at least 1'),
+        (partial(RESULT.correlated, 'a'), 'threshold must be of type float'),
+    ],
+)
+def test_numbers_that_cannot_be_are_named(call, said):
     with pytest.raises(calib_ros.CalibrationError, match=said):
         call()
 

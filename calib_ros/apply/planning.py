@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
-from calib_ros.annotated import as_annotated
+from calib_ros.annotated import Count, NotNegative, as_annotated
 from calib_ros.apply.candidates import travel_times, visit_order
 from calib_ros.apply.design import (
     Candidates,
@@ -249,11 +249,11 @@ def plan(
     design: Design,
     candidates: FloatArray,
     task: FloatArray,
-    count: int,
+    count: Count,
     criterion: Criterion = 'd',
-    apart: float = STILL,
+    apart: NotNegative = STILL,
     velocities: FloatArray | None = None,
-    draws: int = 25,
+    draws: Count = 25,
     progress: Notify = quiet,
     chosen: Index | None = None,
 ) -> Plan:
@@ -274,6 +274,11 @@ def plan(
     speeds = np.ones(joints) if velocities is None else velocities
     if speeds.shape != (joints,) or not (speeds > 0.0).all():
         raise ConfigError(f'velocities must be {joints} positive numbers, not {speeds}')
+    last = len(candidates) - 1
+    if chosen is not None and (chosen.shape != (count,) or not set(chosen) <= {*range(last + 1)}):
+        raise ConfigError(
+            f'chosen must be {count} numbers from 0 to {last}, not {chosen.tolist()!r:.60}'
+        )
     excited = design.determined_by(candidates)
     if chosen is None:
         chosen = choose(excited, candidates, count, criterion, task, apart, progress)

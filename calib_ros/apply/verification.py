@@ -28,7 +28,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from scipy.spatial import cKDTree
 
-from calib_ros.annotated import as_annotated
+from calib_ros.annotated import Positive, as_annotated
 from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
@@ -143,7 +143,7 @@ class Verification(Shown):
 def verify(
     arm: Calibration,
     sets: Sequence[Observations],
-    tolerance: float | None,
+    tolerance: Positive | None,
     confidence: float = CONFIDENT,
     new_base: bool = False,
     commanded: FloatArray | None = None,
@@ -167,7 +167,7 @@ def verify(
     Raises InputError for too few poses, distances, unknown frames, or poses far from all commands.
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
-    _check(arm, sets, tolerance, confidence, fitted)
+    _check(arm, sets, confidence, fitted)
     group = configurations(np.concatenate([each.joints for each in sets]))
     comparison, left, uncorrected = _compared(arm, sets, commanded, fitted, group)
     progress(2 / 3)
@@ -296,17 +296,11 @@ def _decided(
 
 
 def _check(
-    arm: Calibration,
-    sets: Sequence[Observations],
-    tolerance: float | None,
-    confidence: float,
-    fitted: tuple[str, ...],
+    arm: Calibration, sets: Sequence[Observations], confidence: float, fitted: tuple[str, ...]
 ) -> None:
     chain = arm.chain
     if not sets:
         raise ConfigError('sets must hold at least one set of Observations')
-    if tolerance is not None and not 0.0 < tolerance < np.inf:
-        raise ConfigError(f'tolerance must be positive and finite, not {tolerance} m')
     if not 0.5 < confidence < 1.0:
         raise ConfigError(f'confidence must be between 0.5 and 1, not {confidence}')
     for each in sets:

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from calib_ros.annotated import Count, NotNegative, Share, as_annotated
 from calib_ros.decision.comparison import Comparison, GroupVerdict
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Reason
 from calib_ros.decision.region import Region
 from calib_ros.decision.steps import Step
-from calib_ros.errors import ConfigError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.fitted import ParameterRow
@@ -113,14 +113,13 @@ class Identification(Shown):
         """
         return self.posterior.expected(q)
 
-    def confidence_ellipsoid(self, q: FloatArray, level: float = CONFIDENT) -> FloatArray:
+    @as_annotated
+    def confidence_ellipsoid(self, q: FloatArray, level: Share = CONFIDENT) -> FloatArray:
         """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position.
 
         By the F distribution if the noise was estimated, by chi-squared (its limit) if it is
         given.
         """
-        if not 0.0 < level < 1.0:
-            raise ConfigError(f'level must be between 0 and 1, as 0.95, not {level}')
         jacobian = ErrorModel(self.chain, self.names).jacobian(q)[:, :3]
         sources = self.uncertainty.parts
         shares = np.array([np.einsum('ncp,pr,ncr->n', jacobian, s, jacobian) for s in sources])
@@ -136,7 +135,8 @@ class Identification(Shown):
         length = np.sqrt(square[:, np.newaxis] * np.maximum(values, 0.0))
         return np.asarray(np.swapaxes(vectors * length[:, np.newaxis, :], 1, 2))
 
-    def predicted_sigma(self, count: int = 300) -> FloatArray:
+    @as_annotated
+    def predicted_sigma(self, count: Count = 300) -> FloatArray:
         """Return standard deviations (count,) [m] of positions over the joint range.
 
         The root of the trace of the position covariance at seeded random configurations.
@@ -144,7 +144,8 @@ class Identification(Shown):
         q = self.chain.random_joints(count, np.random.default_rng(0))
         return np.asarray(np.sqrt(np.trace(self.pose_covariance(q)[:, :3, :3], axis1=1, axis2=2)))
 
-    def correlated(self, threshold: float = 0.9) -> tuple[tuple[str, str, float], ...]:
+    @as_annotated
+    def correlated(self, threshold: NotNegative = 0.9) -> tuple[tuple[str, str, float], ...]:
         """Return pairs of parameters whose correlation exceeds a threshold, strongest first."""
         return identifiability.correlated(self.covariance, self.names, threshold)
 

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calib_ros.annotated import check_fields
+from calib_ros.annotated import Fraction, NotNegative, Positive, Several, check_fields
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import SCATTER
@@ -50,22 +50,22 @@ class Problem(Shown):
     held_out: Observations | Sequence[Observations] | None = None
     """Pairs that judge the result and are never fitted. Without them it is judged by
     cross-validation over whole configurations."""
-    sigma_position: float = Settings.sigma_position
-    sigma_orientation: float = Settings.sigma_orientation
+    sigma_position: Positive = Settings.sigma_position
+    sigma_orientation: Positive = Settings.sigma_orientation
     """Standard deviations [m, rad] of measurements without a covariance. Their ratio weights
     position against orientation; the size of the noise is estimated."""
     fixed: Sequence[str] = ()
     """Parameters to hold at their nominal values; `*` and `?` match as in file names."""
-    folds: int = Settings.folds
+    folds: Several = Settings.folds
     """Number of cross-validation folds."""
-    largest_length: float = Settings.largest_length
-    largest_angle: float = Settings.largest_angle
+    largest_length: NotNegative = Settings.largest_length
+    largest_angle: NotNegative = Settings.largest_angle
     """Largest accepted offsets [m, rad], beyond any fault of the right robot."""
-    largest_error: float = Settings.largest_error
+    largest_error: NotNegative = Settings.largest_error
     """Largest accepted RMS position error [m] on held-out poses."""
     loss: str = Settings.loss
     """Treatment of gross errors (`robust.py`): redescending, huber or none."""
-    priors: Mapping[str, float] = field(default_factory=dict)
+    priors: Mapping[str, Positive] = field(default_factory=dict)
     """Standard deviations [m, rad] of parameters about their nominal values, by name or pattern
     such as `*.a`; the first match applies."""
     effects: Sequence[str] = ()
@@ -75,16 +75,16 @@ class Problem(Shown):
     of measurement."""
     world_frame: str = ''
     """Frame of the measured poses, for the record."""
-    separations: Sequence[tuple[str, str, float]] = ()
+    separations: Sequence[tuple[str, str, Positive]] = ()
     """Pairs of base frames whose origins are a known distance [m] apart: sockets of a ball on the
     flange. Their worlds are parallel to the arm's base."""
     learned: Learned | None = None
     """Priors estimated from the data, for parameters without one (`evidence.py`)."""
-    sigma_pixel: float = Settings.sigma_pixel
-    sigma_touch: float = Settings.sigma_position
+    sigma_pixel: Positive = Settings.sigma_pixel
+    sigma_touch: Positive = Settings.sigma_position
     """Standard deviations [px] of image coordinates of a board point, and [m] of heights over a
     plane."""
-    sigma_scale: float = 0.0
+    sigma_scale: Fraction = 0.0
     """Standard deviation of the scale of the measuring device [1], if checked with a known
     length; otherwise 0."""
     of_messages: bool = False
@@ -92,14 +92,6 @@ class Problem(Shown):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        priors = {f'the prior of {pattern}': sigma for pattern, sigma in self.priors.items()}
-        for name, sigma in (self.sigmas | priors).items():
-            if not 0.0 < sigma < np.inf:
-                raise ConfigError(f'{name} must be a positive number, not {sigma}')
-        if not 0.0 <= self.sigma_scale < 1.0:
-            raise ConfigError(f'sigma_scale must be from 0 to 1, not {self.sigma_scale}')
-        if self.folds < 2:
-            raise ConfigError(f'folds must be an integer of at least 2, not {self.folds}')
         if self.loss not in LOSSES:
             raise UnknownNameError('loss', self.loss, LOSSES)
         self._check_sets()
@@ -122,12 +114,10 @@ class Problem(Shown):
             if observations.pixels is not None:
                 require_lens(self.model.frame(observations.camera).lens, observations.camera)
         sockets = {each.base for each in self.sets if each.socket}
-        for *pair, distance in self.separations:
+        for *pair, _ in self.separations:
             for base in pair:
                 if base not in sockets:
                     raise UnknownNameError('socket that is a known distance away', base, sockets)
-            if not distance > 0.0:
-                raise ConfigError(f'the distance of sockets must be positive, not {distance}')
 
     def _check_held(self, observations: Observations) -> None:
         """Refuse values of joints that cannot move: equal limits may be none at all."""

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib_ros.annotated import as_annotated
+from calib_ros.annotated import Count, Positive, as_annotated
 from calib_ros.errors import ColumnsError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import Codes, Columns, columns_of, measured
@@ -43,9 +43,9 @@ USUAL_SIGMAS = Settings().sigmas
 @as_annotated
 def read_table(
     path: Path | str,
-    joints: int,
+    joints: Count,
     sessions: Sequence[str] = (),
-    sigmas: tuple[float, float] = USUAL_SIGMAS,
+    sigmas: tuple[Positive, Positive] = USUAL_SIGMAS,
     eye_in_hand: bool = False,
     foreign: Foreign | None = None,
     progress: Notify = quiet,

@@ -22,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calib_ros.annotated import as_annotated
+from calib_ros.annotated import NotNegative, as_annotated
 from calib_ros.decision import changes, mistakes
 from calib_ros.decision.changes import SCALE_OF_DEVICE, Effects, Explanation, Information, root_of
 from calib_ros.decision.comparison import Comparison, compare, residuals
@@ -52,8 +52,8 @@ from calib_ros.shown import rows_in_words
 def recalibrate(
     previous: Calibration,
     problem: Problem,
-    years: float,
-    growth: float = GROWTH,
+    years: NotNegative,
+    growth: NotNegative = GROWTH,
     new: Sequence[str] = (),
 ) -> Recalibration:
     """Update a calibration with the poses of a problem.
