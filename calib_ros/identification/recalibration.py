@@ -242,7 +242,7 @@ class _Arm:
             chain, names = region.chain, region.names
             square, device = region.square, region.device @ region.device.T
         named = tuple(map(Parameter, names))
-        wandered = np.diag(drift_of(named, growth)) * max(years, 0.0)
+        wandered = np.diag(drift_of(named, growth)) * years
         return cls(previous, chain, named, square + wandered, device)
 
     @cached_property

@@ -63,10 +63,9 @@ def test_a_frame_may_have_moved_far_where_errors_are_large():
 
 def test_an_arm_is_known_less_the_longer_it_was_not_measured():
     previous = Calibration.of(identify(problem(UR10E, 40, 0)))
-    years = [-1.0, 0.0, 1.0, 10.0]
+    years = [0.0, 1.0, 10.0]
     known = [recalibrate(previous, problem(UR10E, 8, 1), each).known_before for each in years]
-    assert known[0] == known[1]
-    assert (np.diff(known[1:]) > 0.0).all()
+    assert (np.diff(known) > 0.0).all()
 
 
 def test_a_document_is_in_millimetres():
