@@ -13,6 +13,7 @@ import re
 import typing
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import is_dataclass
 from functools import cache, partial, wraps
 from numbers import Integral, Real
 from types import NoneType, UnionType
@@ -41,7 +42,7 @@ _hints: Callable[[Any], dict[str, Any]] = cache(
 
 
 def as_annotated(function: _F) -> _F:
-    """Make a function refuse arguments that are not as annotated.
+    """Make a function refuse arguments that are not as annotated, and return read-only arrays.
 
     Sequences arrive as tuples, arrays as `array_of` returns them, without NaN.
     """
@@ -55,7 +56,7 @@ def as_annotated(function: _F) -> _F:
             return function(*args, **named)  # whose error names it
         for name, value in given.arguments.items():
             given.arguments[name] = _fitting(value, hints.get(name, Any), name, True)
-        return function(*given.args, **given.kwargs)
+        return _read_only(function(*given.args, **given.kwargs))
 
     return typing.cast(_F, call)
 
@@ -107,6 +108,23 @@ def _fitting(value: Any, hint: Any, name: str, finite: bool) -> Any:
     made = ' (Calibration.of(result))' if wanted == 'Calibration' else ''
     shown = f'{value!r:.60}' if isinstance(value, _QUOTED) else type(value).__name__
     raise ConfigError(f'{name} must be of type {wanted}{made}, not {shown}')
+
+
+def _read_only(made: Any) -> Any:
+    """Return an array, or a result that holds some, so that nobody changes it by mistake.
+
+    These are views: an array that was given stays as it was. So do inputs, which check themselves.
+    """
+    if type(made).__name__ == 'ndarray':
+        made = made.view()
+        made.flags.writeable = False
+    elif type(made) is tuple:
+        return tuple(map(_read_only, made))
+    elif is_dataclass(made) and not hasattr(made, '__post_init__'):
+        for name in made.__dataclass_fields__:
+            if (found := _read_only(value := getattr(made, name))) is not value:
+                object.__setattr__(made, name, found)
+    return made
 
 
 def _passing(value: Any, name: str, test: Callable[[Any], bool], words: str) -> Any:

@@ -80,6 +80,18 @@ def test_arguments_of_another_type_are_named(call, said):
         call()
 
 
+def test_results_are_read_only():
+    """An offset by mistake changed the result for all who hold it."""
+    commands = JOINTS[:5].copy()
+    corrected = calib_ros.compensate(CORRECTED, commands)
+    verified = calib_ros.verify(ARM, [SEEN], 1e-3).comparison.after
+    results = ARM.covariance, PLAN().joints, corrected.command, verified.position
+    for array in (*results, RESULT.uncertainty.parts, RESULT.confidence_ellipsoid(JOINTS[:1])):
+        with pytest.raises(ValueError, match='read-only'):
+            array += 1.0
+    commands += 1.0  # what was given stays the caller's
+
+
 @pytest.mark.parametrize(
     ('call', 'said'),
     [

@@ -98,7 +98,7 @@ def test_what_is_commanded_of_a_coupled_joint_does_not_count(compensator, path):
 
 def test_measurements_find_their_command_whatever_is_reported_of_it(compensator, path):
     q, _ = path
-    measured = compensate(compensator, q).joints
+    measured = compensate(compensator, q).joints.copy()
     measured[:, HAND] = -q[:, 1] - q[:, 2]
     commanded, corrected = _meant(PALLETISER, compensator.calibrated, measured, q)
     np.testing.assert_array_equal(commanded, q)

@@ -93,7 +93,7 @@ def test_a_correction_that_did_not_arrive_shows(cell, arm, program):
     """Against what was commanded: corrected commands pass, uncorrected ones do not."""
     true, result, _ = cell
     meant = program
-    moved = compensate(Compensator(UR, result.chain), meant).joints
+    moved = compensate(Compensator(UR, result.chain), meant).joints.copy()
     for joints, verdict in ((moved, 'PASS'), (meant, 'FAIL')):
         seen = [measured(true, joints[::-1])]
         found = verify(arm, seen, 5e-4, commanded=meant)
