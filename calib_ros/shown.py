@@ -152,4 +152,9 @@ def _brief(value: object) -> str:
     text = repr(value)
     if len(text) > 60 and is_dataclass(value) and 'array(' in text:
         return f'<{type(value).__name__}>'
+    return clipped(text)
+
+
+def clipped(text: str) -> str:
+    """Return a text, or the beginning of a long one."""
     return text if len(text) <= 60 else text[:57] + '...'

@@ -146,7 +146,7 @@ def plan_report(
             predicted = f'Predicted RMS position error: {1e3 * found.accuracy[-1]:.4f} mm.'
             verdict = replace(verdict, text=(*verdict.text, predicted))
         steps = (
-            'Drive to each pose, wait until the arm stands still, and measure.',
+            'Check for collisions, drive to each pose, wait until the arm is still, and measure.',
             'Then identify: calib_ros identify.',
         )
         if found.lacking or not known:
@@ -182,7 +182,7 @@ def _visit(chain: Chain, joints: FloatArray) -> Section:
         text=[f'pose {k}' for k in order],
         hoverinfo='text',
     )
-    about = 'In the base frame. Check for collisions before you drive there.'
+    about = 'In the base frame.'
     return Section('visit', 'Where the target will be', (about,), figures.space(path), height=560)
 
 

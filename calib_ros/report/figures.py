@@ -15,6 +15,7 @@ from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.joint import Joint
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.poses import Poses, numbers, unit_of
@@ -157,7 +158,6 @@ def histogram(
     counts = np.zeros((len(chain.joints), parts))
     labels, rows = [], []
     for k, joint in enumerate(chain.joints):
-        factor, unit, digits = unit_of(joint)
         lower, upper = joint.range
         low, high = float(joints[:, k].min()), float(joints[:, k].max())
         free = joint.lower is None and joint.upper is None
@@ -165,11 +165,10 @@ def histogram(
             lower, upper = low, low + upper - lower
         lower, upper = min(lower, low), max(upper, high)
         counts[k] = np.histogram(joints[:, k], parts, (lower, upper))[0]
-        ends = f'{factor * lower:.0f} to {factor * upper:.0f} {unit}' + ' (no limits)' * free
+        ends = _span(joint, lower, upper, 0) + ' (no limits)' * free
         labels.append(f'{label(joint.name)}<br>{ends}')
-        used = f'{factor * low:.{digits}f} to {factor * high:.{digits}f} {unit}'
         share = 100.0 * float(np.mean(counts[k] > 0))
-        rows.append((joint.name, ends, used, f'{share:.0f} %'))
+        rows.append((joint.name, ends, _span(joint, low, high), f'{share:.0f} %'))
     x = numbers(100.0 * (np.arange(parts) + 0.5) / parts, 4)
     z = numbers(np.where(counts > 0, counts, np.nan))
     look = scale_of('poses')
@@ -178,6 +177,14 @@ def histogram(
     across = axis('position in the joint range [%]', range=[0, 100])
     layout = {'xaxis': across, 'yaxis': REVERSED, 'margin': _margin(130, 20, 50)}
     return {'data': [mesh], 'layout': layout}, tuple(rows)
+
+
+def _span(joint: Joint, low: float, high: float, digits: int | None = None) -> str:
+    """Return two joint values [rad, m] as text with their unit, zero without a sign."""
+    factor, unit, usual = unit_of(joint)
+    digits = usual if digits is None else digits
+    ends = (f'{round(factor * value, digits) + 0.0:.{digits}f}' for value in (low, high))
+    return ' to '.join(ends) + (unit if unit == '°' else f' {unit}')
 
 
 def drives(chain: Chain, joints: FloatArray) -> Figure | None:
@@ -223,7 +230,7 @@ def error_map(survey: Survey) -> Figure:
         place = {'xref': f'x{end} domain', 'yref': 'paper', 'x': 0, 'y': 1, 'yanchor': 'bottom'}
         layout['annotations'].append(title | place)
         layout[f'xaxis{end}'] = axis('radius [m]')
-        layout[f'yaxis{end}'] = {} if k else axis('height [m]')
+        layout[f'yaxis{end}'] = {'showticklabels': False} if k else axis('height [m]')
     layout['margin'] = _margin(60, 30, 50)
     return {'data': data, 'layout': layout}
 

@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeAlias
 import calib_ros
 from calib_ros.files.rows import Input
 from calib_ros.report.advice import Advice
+from calib_ros.shown import clipped
 from calib_ros.texts import in_markdown, one_line
 
 State: TypeAlias = Literal['good', 'bad', 'open', 'info']
@@ -28,6 +29,8 @@ TYPED = re.compile(
     rf'((?:(?<![\w-])--[a-z][\w-]*|calib_ros [a-z\d]+)(?: (?:{VALUE})(?<![.,;:]))?)'
 )
 """An option or a command, with a value that is no plain word."""
+BEFORE_UNIT = re.compile(r'(?<=\d) (?=(?:%|mm|mrad)(?!\w))')
+"""Where no line is broken."""
 NEEDS_JINJA = (
     'report.html is not written: it needs jinja2 and plotly (pip install "calib_ros[report]", '
     'or apt install python3-jinja2 python3-plotly)'
@@ -117,8 +120,8 @@ class Report:
 
     @property
     def title(self) -> str:
-        """Return the name of the robot, with its serial number if known."""
-        return ' '.join(filter(None, (self.robot, self.origin.serial)))
+        """Return the name of the robot, with its serial number if known, on one line."""
+        return clipped(' '.join(filter(None, (self.robot, self.origin.serial))))
 
     @property
     def of(self) -> str:
@@ -199,9 +202,14 @@ def with_code(text: str) -> str:
 
 
 def _shown(value: object) -> object:
-    """Return a foreign text, indented as it is, without characters that hide or reverse others."""
+    """Return a foreign text, indented as it is, without characters that hide or reverse others.
+
+    A number on a single line stays with its unit; texts of several lines may be copied.
+    """
     if isinstance(value, str) and not hasattr(value, '__html__'):
         lines = value.split('\n')
+        if len(lines) == 1:
+            return BEFORE_UNIT.sub('\xa0', one_line(value))
         return '\n'.join(' ' * (len(x) - len(x.lstrip(' '))) + one_line(x) for x in lines)
     return value
 

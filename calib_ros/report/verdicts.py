@@ -33,7 +33,7 @@ COMPUTED = (
     '"Before" is not measured but computed: the nominal arm in its best frames, at the same '
     'joint values.'
 )
-NO_SCALE = 'No interval holds an error of the scale of the device: check it with a known length.'
+NO_SCALE = 'Intervals do not include a scale error of the device: check it with a known length.'
 TOLERANCE = 'For PASS or FAIL, give --tolerance, the RMS error [mm] that your task allows.'
 STANDINGS: dict[str, tuple[Headline, tuple[str, ...]]] = {
     'PASS': (

@@ -117,7 +117,7 @@ def wide(chromium, result):
 
 def test_the_numbers_are_those_of_the_result(wide, result):
     document = json.loads((result / 'result.json').read_text())
-    text = wide.page.inner_text('main')
+    text = wide.page.inner_text('main').replace('\xa0', ' ')
     for when in ('before', 'after'):
         assert f'{document["validation"][when]["rms_mm"]:.3f} mm (' in text
         for name in ('rms_mm', 'mean_mm', 'max_mm', 'mean_plus_3_sigma_mm', 'rms_mrad'):
@@ -307,6 +307,33 @@ def test_a_printed_fleet_is_whole(chromium, tmp_path):
     assert max(printed) <= 688
     assert 'RMS of 0042' in seen.page.inner_text('#nights')  # its choice is not printed
     seen.page.close()
+
+
+def test_a_printed_plan_is_no_certificate(chromium, tmp_path):
+    """Its first sheet held nothing else, and one heading had no figure."""
+    plan = tmp_path / 'plan.csv'
+    arguments = ('--poses', '12', '--draw', '60', '--out', str(plan))
+    assert main(['plan', '--chain', 'ur5e', *arguments]) == 0
+    seen = Seen(chromium, tmp_path / 'plan.report.html', 1280)
+    seen.drawn()
+    page = seen.page
+    assert page.is_visible('text=Where the target will be')
+    printed_widths(page)
+    assert page.is_visible('text=Then identify')
+    for hidden in ('.certificate', 'text=Where the target will be', 'summary', 'footer'):
+        assert not page.is_visible(hidden)
+    seen.end()
+
+
+def test_columns_and_maps_are_within_a_telephone(chromium, result):
+    seen = Seen(chromium, result / 'report.html', 400)
+    used = "document.querySelectorAll('#rows th')[4]"
+    assert seen.page.evaluate(f'{used}.textContent') == 'used'
+    assert seen.page.evaluate(f'{used}.getBoundingClientRect().right') < 400
+    seen.drawn()
+    assert seen.page.locator('#map .ytick text').count() > 0
+    assert seen.page.locator('#map .y2tick text').count() == 0  # they covered the map beside
+    seen.end()
 
 
 def test_many_refused_poses_on_a_telephone(chromium, tmp_path, monkeypatch):

@@ -122,10 +122,13 @@ def test_joints_without_limits_are_not_given_any(rng):
     joints = chain.random_joints(50, rng)
     figure, rows = histogram(chain, joints)
     assert figure['data'][0]['x'] == pytest.approx(100.0 * np.arange(1, 72, 2) / 72, rel=1e-3)
-    assert [row[1] for row in rows[:2]] == ['-180 to 180 ° (no limits)', '-360 to 360 °']
+    assert [row[1] for row in rows[:2]] == ['-180 to 180° (no limits)', '-360 to 360°']
     joints[:, 0] += 2.0  # a turn from where it was measured, not what is between both ranges
     low = np.degrees(joints[:, 0].min())
-    assert histogram(chain, joints)[1][0][1] == f'{low:.0f} to {low + 360.0:.0f} ° (no limits)'
+    assert histogram(chain, joints)[1][0][1] == f'{low:.0f} to {low + 360.0:.0f}° (no limits)'
+    joints[:, 0] -= joints[:, 0].min() + 1e-3
+    joints[1, 0] = 6.0
+    assert histogram(chain, joints)[1][0][1] == '0 to 360° (no limits)'  # not -0
 
 
 @pytest.mark.parametrize('count', [1, 5, 30, 3001])

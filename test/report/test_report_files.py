@@ -18,7 +18,7 @@ from calib_ros.apply.verification import verify
 from calib_ros.files.export import exports
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
-from calib_ros.report.page import Origin, markdown, on_paper
+from calib_ros.report.page import Origin, markdown, on_paper, render
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verdicts import verification_report
 
@@ -75,10 +75,24 @@ def of_the_certificate(report, monkeypatch):
     monkeypatch.setattr(
         weasyprint.HTML, 'write_pdf', lambda self: pages.extend(self.render().pages) or b''
     )
-    alone = replace(report, sections=(), origin=Origin(operator='A. Smith'))
+    origin = Origin(operator='A. Smith', serial=300 * '7')
+    alone = replace(report, sections=(), origin=origin)
     on_paper(alone)
     monkeypatch.setattr(weasyprint.HTML, 'write_pdf', printed)
-    return pages[:-1]  # the last has the line about the software
+    return pages
+
+
+def test_a_number_is_not_parted_from_its_unit(solved):
+    page, _, _ = render(report_of(*solved, tolerance=1e-3)).partition('<script')
+    assert '95\xa0% interval' in page
+    assert not re.search(r'\d (?:%|mm|mrad)', page)
+
+
+def test_a_long_serial_number_is_a_short_title(solved):
+    """At the foot of each sheet it covered the number of the page."""
+    report = replace(report_of(*solved), origin=Origin(serial=300 * '7'))
+    assert len(report.title) == 60
+    assert report.title.startswith('ur5e 7')
 
 
 def test_a_certificate_is_one_sheet(solved, monkeypatch):
