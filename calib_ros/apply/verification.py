@@ -129,7 +129,7 @@ class Verification(Shown):
 
     @property
     def each(self) -> tuple[Attained, ...]:
-        """Return the accuracy at each configuration; nothing with more than LISTED."""
+        """Return the accuracy at each configuration; empty beyond LISTED of them."""
         if self.configurations > LISTED:
             return ()
         both = (self.comparison.before.position, self.comparison.after.position)
@@ -158,8 +158,8 @@ def verify(
     `progress` receives the share done.
 
     With `new_base` the measuring device was moved, with `new_tool` the target was replaced or
-    remounted. Their frames are fitted, and absorb the errors of as many configurations, of three
-    freedoms each, as they have freedoms.
+    remounted. Their frames are fitted: a new base absorbs the errors of two configurations, a new
+    tool those of one.
 
     `commanded` (M, n) are joint values [rad or m] of the uncorrected program: the nominal arm
     defines the wanted poses there. Each measurement belongs to one of them, as it is or corrected.

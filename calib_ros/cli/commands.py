@@ -118,7 +118,7 @@ what is wanted
 poses to choose from
   --candidates FILE  CSV q1..qn of poses to choose from
   --draw N=2000  random candidates, if no file is given
-  --criterion {'|'.join(CRITERIA)}=d  determinant, index, or task error
+  --criterion {'|'.join(CRITERIA)}=d  d: determinant; o2 to o5: index; task: error there
   --apart X=0.001  smallest joint move between poses [rad, m]
   --velocity V+=1  joint velocity [rad/s, m/s]
   --seed N=0  {SEED}
@@ -232,7 +232,7 @@ what to map
   --seed N=0  {SEED}
 a task to place
   --task FILE  CSV x y z qx qy qz qw in the task frame
-  --joint-box Q+  joint range of a task: lower, then upper values
+  --joint-box Q+  joint range of a task [rad, m]: lower, then upper values
   --aim {'|'.join(AIMS)}=mean  error over the task poses to minimise
   --region M*6  where the task may be placed: lower, upper corner
   --cells N=9  placements along each axis

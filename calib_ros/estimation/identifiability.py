@@ -36,7 +36,7 @@ def independent(
     """Return the parameters whose columns are independent of those before them.
 
     `factor` (R, P) is the upper triangular factor of the weighted Jacobian, columns in the order
-    of the names: of parameters that trade against each other, the last are left out and stay
+    of the names: of parameters that trade off against each other, the last are left out and stay
     nominal. At least the share `tolerance` (P,) of a column must be left by those before it, and
     of the largest column more than rounding.
     """

@@ -249,7 +249,7 @@ class Observations(Shown):
         return self.velocity is not None and bool(self.velocity.any())
 
     def between(self, names: Mapping[str, str]) -> Observations:
-        """Return them between the frames that have these names now."""
+        """Return them with their base and tool renamed; names that are not given stay."""
         base, tool = (names.get(name, name) for name in (self.base, self.tool))
         return replace(self, base=base, tool=tool)
 

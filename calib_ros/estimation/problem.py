@@ -278,8 +278,8 @@ class Problem(Shown):
     def free(self) -> tuple[Parameter, ...]:
         """Return the parameters to fit, by priority.
 
-        Of parameters that trade against each other the last are kept nominal: effects, and before
-        them lengths d, which become absurd between nearly parallel axes.
+        Of parameters that trade off against each other, the last are kept nominal: effects, and
+        before them lengths d, which become absurd between nearly parallel axes.
         """
         model = self.model
         used = {name for each in self.sets for name in (each.base, each.tool)}

@@ -213,9 +213,10 @@ class Calibration(Shown):
         return left
 
     def limit(self, sets: Sequence[Observations] = ()) -> float | None:
-        """Return the RMS error [m] of new poses up to which it holds there, if known.
+        """Return the largest RMS error [m] of new poses at which it still holds, None if unknown.
 
-        ALIKE times its former error, or the one expected there, but no more than it removes there.
+        ALIKE times its former error; if larger, ALIKE times the error expected at the poses of
+        `sets`, but no more than it removes there.
         """
         if self.residual is None:
             return None

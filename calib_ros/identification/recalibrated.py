@@ -94,15 +94,15 @@ class Recalibration(Shown):
 
     @property
     def perhaps_moved(self) -> bool:
-        """Tell whether changes too many, or too little, may be a single frame moved far away.
+        """Tell whether a single frame moved far away may look like several changes, or like none.
 
-        There the model is linear elsewhere.
+        So far from the earlier arm the linear model of changes does not hold.
         """
         far = self.before.rms_mm > 1e3 * Settings.largest_error and not self.reused
         return far and (len(self.changed) > 1 or self.unexplained <= changes.FALSE)
 
     def with_moved(self, frame: str, earlier: Chain, found: Recalibration) -> Recalibration:
-        """Return the result with a `frame` that was free named as what has changed.
+        """Return the result, fitted with a free `frame`, that names this frame as the change.
 
         `earlier` is the arm before, and `found` has its errors.
         """

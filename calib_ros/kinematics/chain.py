@@ -145,7 +145,7 @@ class Chain(Shown):
     def held(self) -> Mapping[int, float]:
         """Return the values [rad or m] of joints with equal limits, by number.
 
-        They never move, or only by couplings; what is reported of them counts for nothing.
+        They never move, or only by couplings; their reported values are ignored.
         """
         ends = ((k, joint.lower, joint.upper) for k, joint in enumerate(self.joints))
         return {k: lower for k, lower, upper in ends if lower is not None and lower == upper}
@@ -322,7 +322,7 @@ class Chain(Shown):
     ) -> tuple[FloatArray, FloatArray]:
         """Return the target's axes (3, 3, B) and origin (3, B) [m] in the world.
 
-        As `forward`, at joint values (n, B); the first index of the axes counts them.
+        As `forward`, at joint values (n, B); `axes[k]` is axis k.
         """
         frames = np.empty((len(q) + 1, 4, 3, q.shape[1]))
         self.walk.frames(self.effective(q, approach), self.frame(base).matrix, frames)

@@ -96,7 +96,7 @@ class CalibrationSession:
         self._live = LiveEstimate(partial(self.problem_of, posed=True))
 
     def take(self, parts: Sequence[Part]) -> None:
-        """Take messages in the order of their places."""
+        """Take messages, in the order of their `places` in the batch."""
         try:
             self._pipeline.take(self._filter.pieces(parts, self.recording))
         finally:
