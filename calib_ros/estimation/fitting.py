@@ -35,6 +35,7 @@ from calib_ros.estimation.sizes import LEAST_SIZE, SETTLED, SPREAD
 from calib_ros.estimation.start import start_frames
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
+from calib_ros.shown import counted
 
 SOME = 2 * SOME_POSES  # samples for a first fit or a linear model
 FOLLOWED = 2.0
@@ -241,9 +242,9 @@ def _require_enough(problem: Problem, names: Sequence[str]) -> None:
         configurations += count
     if rows < len(names):
         width, sets = problem.kinds[0].rows, len(problem.sets)
-        of = f', also of {sets} sessions, devices and targets' if sets > 1 else ''
+        of = f', with frames for {sets} sessions, devices or targets' if sets > 1 else ''
         raise TooFewObservationsError(
             configurations,
             -(-len(names) // width),
-            f'{width} equations each for {len(names)} parameters{of}',
+            f'{counted(width, "equation")} each for {len(names)} parameters{of}',
         )

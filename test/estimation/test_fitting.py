@@ -16,6 +16,7 @@ from calib_ros.estimation.fitted import Simpler, _to_values, parameter_rows
 from calib_ros.estimation.fitting import SOME
 from calib_ros.estimation.identifiability import Uncertainty
 from calib_ros.estimation.noise import Noise
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.sizes import LEAST_SIZE
 from calib_ros.kinematics import se3
@@ -84,7 +85,11 @@ def test_fewer_equations_than_parameters_are_refused():
     fitting._require_enough(problem, ['x'] * 36)
     with pytest.raises(TooFewObservationsError) as caught:
         fitting._require_enough(problem, ['x'] * 37)
+    assert '6 equations each for 37 parameters, with frames for 2 sessions' in str(caught.value)
     assert (caught.value.configurations, caught.value.needed) == (8, 7)
+    touch = Problem(UR10E, Observations.touching(twice.joints))
+    with pytest.raises(TooFewObservationsError, match=r'\(1 equation each for 26 parameters\)'):
+        fitting._require_enough(touch, ['x'] * 26)
     empty = replace(problem, more=(points.select(np.zeros(0, dtype=int)),))
     with pytest.raises(InputError, match='no pairs to fit between base_B and tool'):
         fitting._require_enough(empty, [])

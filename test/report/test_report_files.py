@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from calib_ros.apply.verification import verify
 from calib_ros.files.export import exports
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
+from calib_ros.report.documents import as_document
 from calib_ros.report.page import Origin, markdown, on_paper, render
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verdicts import verification_report
@@ -80,6 +82,14 @@ def of_the_certificate(report, monkeypatch):
     on_paper(alone)
     monkeypatch.setattr(weasyprint.HTML, 'write_pdf', printed)
     return pages
+
+
+def test_the_keys_of_a_result_are_documented(solved):
+    told = as_document(solved[1], {})
+    nested = ('fitted', 'noise_in_sigma', 'predicted_sigma_mm', 'region', 'validation')
+    names = {*told, *(key for name in nested for key in told[name])}
+    formats = (Path(__file__).parents[2] / 'docs/formats.md').read_text()
+    assert [name for name in sorted(names) if f'`{name}`' not in formats] == []
 
 
 def test_a_number_is_not_parted_from_its_unit(solved):
