@@ -220,7 +220,7 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
     own = History('history').rows('<C>')[-1]
     assert f'href="robots/%253CC%253E/{own.key}.html"' in page
     robots = (folder / f'report/robots/%3CC%3E/{own.key}.html').read_text()
-    assert 'within the tolerance of 0.3 mm RMS' in robots
+    assert 'within the tolerance of 0.3\xa0mm RMS' in robots
     assert len(pandas.read_parquet('history')) == 11
 
     plant = json.loads((folder / 'plant.yaml').read_text())

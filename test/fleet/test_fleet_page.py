@@ -71,7 +71,7 @@ def test_states_from_the_worst_to_the_best():
 def test_the_page_tells_all_that_is_to_be_said_of_a_robot():
     refused = {'verdict': 'refused', 'reasons': ('the arm is another one',)}
     fleet = [status('2', {'x.csv': 'damaged'}, **refused)]
-    page = fleet_page(Path('report'), fleet, Run())
+    page = fleet_page(Path('report'), fleet, Run()).replace('\xa0', ' ')
     assert 'refused, beyond tolerance, unreadable</span>' in page
     for action in fleet[0].actions:
         assert f'<li>{action}</li>' in page

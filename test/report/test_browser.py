@@ -297,7 +297,7 @@ def test_printed_figures_are_whole(chromium, result):
 
 
 def test_a_printed_fleet_is_whole(chromium, tmp_path):
-    plant = plants.write_plant(tmp_path, ['0042'], 2, poses=12)
+    plant = plants.write_plant(tmp_path, [60 * '7'], 2, poses=12)
     out = tmp_path / 'out'
     main(['fleet', str(plant), '--history', str(tmp_path / 'history'), '--out', str(out)])
     seen = Seen(chromium, out / 'index.html', 1280)
@@ -305,7 +305,12 @@ def test_a_printed_fleet_is_whole(chromium, tmp_path):
     printed = printed_widths(seen.page)
     assert len(printed) == 2
     assert max(printed) <= 688
-    assert 'RMS of 0042' in seen.page.inner_text('#nights')  # its choice is not printed
+    assert 'RMS of 777' in seen.page.inner_text('#nights')  # its choice is not printed
+    seen.page.close()
+    seen = Seen(chromium, out / 'index.html', 400)
+    assert seen.overflow <= 0
+    state = seen.page.locator('tbody td').nth(1).bounding_box()
+    assert state['x'] + state['width'] < 400.0
     seen.page.close()
 
 
