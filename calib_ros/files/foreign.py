@@ -22,18 +22,27 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.columns import Columns, cell_number, measured
 from calib_ros.files.conventions import finished
 from calib_ros.files.headers import (
-    as_typed,
+    commanded,
     like_joints,
+    listed,
     name_and_unit,
     named_by_option,
+    named_in,
     not_read,
     only,
     places,
 )
 from calib_ros.files.layouts import Expression, Layout
+from calib_ros.files.names import (
+    as_typed,
+    in_doubt,
+    quaternions_in,
+    turns_in,
+)
 from calib_ros.files.sheets import read_sheet
 from calib_ros.files.units import Units
 from calib_ros.files.vocabulary import (
+    IN_TURN,
     JOINT,
     MEASURED_COLUMNS,
     NUMBERS,
@@ -41,6 +50,8 @@ from calib_ros.files.vocabulary import (
     QUATERNION,
     SECONDS,
     SIGMAS,
+    SOCKETS,
+    TURNS,
     UNIT_SIGNS,
     WORDS,
     joint_columns,
@@ -80,6 +91,10 @@ class Foreign:
             made = replace(made, cells={**joints, **made.cells})
         if not self.layout.source:  # a preset is known to leave some out
             notes += not_read(path, [name for name in table.unread() if name != matched])
+            turns = (
+                '' if {*QUATERNION, *TURNS, *IN_TURN} & {*made.cells} else turns_in(table.names)
+            )
+            notes += [f'{path}: {turns}'] * bool(turns)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
         made, skipped = measured(made)
@@ -151,6 +166,8 @@ class _Table:
         self._sheet = read_sheet(path, layout, list(needed), list(own))
         self.notes, self.count = list(self._sheet.notes), len(self._sheet.columns.lines)
         self._columns = self._asked(asked, optional)
+        if not alone:
+            own |= {name: ours for ours, name in quaternions_in(self.names).items()}
         self._columns |= self._named({name: own[name] for name in own if own[name] not in asked})
         if joints and chain is not None:
             self._complete(chain)
@@ -202,19 +219,34 @@ class _Table:
         measured = {name for ours in POSITION if ours in known for name in known[ours].names}
         for ours in [ours for ours in guessed if measured & {*kept[ours].names}]:
             del kept[ours], guessed[ours]  # of a gantry: no column is both
+        if len({*SOCKETS[:2]} & {*known}) == 1:  # a location may be anything
+            kept = {ours: each for ours, each in kept.items() if ours not in SOCKETS[:2]}
         if guessed:
-            self.notes.append(f'by the names of the joints, {", ".join(guessed.values())}')
+            self.notes.append(f'by their names, {", ".join(guessed.values())}')
+        self._refuse_nominal(kept)
         return kept
+
+    def _refuse_nominal(self, kept: Mapping[str, Expression]) -> None:
+        """Refuse columns taken by our names if they may be nominal ones."""
+        count = len({*kept} & {*joint_columns(MOST_NAMES)})
+        doubt = commanded(self.names, count) if 'q1' in kept else ''
+        if {*POSITION} <= {*kept}:
+            called = (self._sheet.called(kept[ours].names[0]) for ours in POSITION)
+            doubt = in_doubt(self.names, [name_and_unit(name)[0] for name in called]) or doubt
+        if doubt:
+            raise InputError(f'{self.path}: {doubt}')
 
     def _complete(self, chain: Chain) -> None:
         """Refuse a table with the values of some joints; those of coupled ones do not count."""
         names = joint_columns(len(chain.joints))
         given = [name for name in names if name in self._columns]
-        if not given and not {*map(str.lower, chain.joint_names)} & {*NUMBERS}:
+        called = all(named_in(self.names, name) for name in chain.joint_names)
+        if not given and not called and not {*map(str.lower, chain.joint_names)} & {*NUMBERS}:
             return
         still = {names[k]: Expression.parse('0') for k in coupled(chain)}
         self._columns = still | self._columns
         if missing := [name for name in names if name not in self._columns]:
+            missing += [] if {*MEASURED_COLUMNS} & {*self._columns} else POSITION
             advice = named_by_option(self.names, missing, len(names), chain.joint_names)
             moving = [name for name in names if name not in still]
             if len(given) == len(moving):  # of an arm whose hand is kept level
@@ -238,12 +270,12 @@ class _Table:
     @property
     def has(self) -> str:
         """Return in words which columns there are."""
-        return f'it has {", ".join(self.header)}'
+        return f'it has {listed(self.header)}'
 
     @property
     def names(self) -> tuple[str, ...]:
         """Return the names of the columns without their units."""
-        return tuple(name_and_unit(name)[0] for name in self.header)
+        return tuple(name_and_unit(name)[0] for name in self._sheet.header)
 
     def unread(self) -> list[str]:
         """Return the names of the columns that nothing is made of."""

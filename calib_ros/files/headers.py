@@ -9,7 +9,16 @@ from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 
-from calib_ros.errors import ColumnsError, InputError
+from calib_ros.errors import LONGEST, ColumnsError, InputError, shortened
+from calib_ros.files.names import (
+    MEASURED_WORDS,
+    NOMINAL_WORDS,
+    OTHER,
+    as_typed,
+    positions_in,
+    quaternions_in,
+    words_of,
+)
 from calib_ros.files.vocabulary import (
     NUMBERS,
     POSITION,
@@ -25,9 +34,9 @@ from calib_ros.shown import some
 def name_and_unit(cell: str) -> tuple[str, str]:
     """Return the name of a column, and its unit if the header says it, or another in brackets."""
     match = UNIT.fullmatch(cell)
-    if match is None:
+    unit = '' if match is None else next(filter(None, match.groups()[1:])).strip()
+    if match is None or {*words_of(unit)} & (MEASURED_WORDS | NOMINAL_WORDS):
         return cell, ''
-    unit = next(filter(None, match.groups()[1:])).strip()
     return match[1], UNIT_SIGNS.get(unit.lower(), unit)
 
 
@@ -53,6 +62,11 @@ def only(found: Sequence[int], name: str) -> int:
             f'column "{name}" comes {len(found)} times: name it by its number ({where})'
         )
     return found[0]
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return the names of columns, so many that a message has room for an option, too."""
+    return shortened(', '.join(filter(None, names)), LONGEST // 4) or 'nothing'
 
 
 def not_read(path: Path, names: Sequence[str]) -> tuple[str, ...]:
@@ -92,45 +106,71 @@ def named_by_option(
     if _only_numbers(header):
         numbers = ','.join(f'{name}=#{k}' for k, name in enumerate(missing, 1))
         return f'Its first line holds numbers, not names: --columns "{numbers}", in its order'
-    found = {
-        name: next((each for each in header if re.match(rf'{name}\b', each, re.I)), 'NAME')
-        for name in missing
-    }
+    coordinates = [name for name in POSITION if name in missing]
+    found: dict[str, str] = dict.fromkeys(missing, 'NAME')
+    found |= positions_in(header, coordinates) if coordinates else {}
     of_joints = {*joint_columns(joints)}
     lacking = of_joints & found.keys()
     whole = bool(joints) and lacking == of_joints
     fewer = bool(lacking) and 'q1' in header and 'q0' not in header
     like = like_joints(header, joints) if lacking and not fewer else {}
     more = '; joint values in another file: --joints FILE' if whole and not like else ''
-    theirs = [next((each for each in header if each.lower() == n.lower()), '') for n in called]
-    rest = [each for each in header if each.lower() not in (*NUMBERS, *WORDS)]
+    theirs = [named_in(header, name) for name in called]
+    rest = [each for each in header if each and each.lower() not in (*NUMBERS, *WORDS)]
     if whole and not like and called and len(rest) == joints and {*POSITION} <= {*header}:
         like = dict(zip(joint_columns(joints), rest, strict=True))
     elif whole and not like and called and all(theirs):
         like = dict(zip(joint_columns(joints), theirs, strict=True))
-        found |= {name: 'NAME' for name in POSITION if name in theirs or name not in header}
+        free = {each for each in header if each not in theirs}
+        found |= {n: 'NAME' for n in POSITION if not {n, found.get(n, '')} & free}
     if whole or like:
-        others = {name: found[name] for name in found if name not in of_joints}
-        found = {**(like or {'q*': 'NAME*'}), **others}
+        more_of = {name: each for name, each in found.items() if name not in of_joints}
+        found = (like or {'q*': 'NAME*'}) | more_of
+    if {*POSITION} <= {*missing} and found[POSITION[0]] != 'NAME':
+        found |= quaternions_in(header, sure=False)
     given = ','.join(f'{name}={as_typed(each)}' for name, each in found.items())
+    if len(given) > LONGEST // 3:  # a message would lose its middle
+        short = {each: f'#{header.index(each) + 1}' for each in found.values() if each in header}
+        given = ','.join(f'{n}={short.get(each, as_typed(each))}' for n, each in found.items())
     options = f'Columns of other names: --columns "{given}"{more}'
     return f'Is it another arm (--chain)? {options}' if fewer else options
 
 
-def as_typed(name: str) -> str:
-    """Return the name of a column as --columns takes it."""
-    return name if re.fullmatch(r'[#\w.*]+', name) else f'{{{name}}}'
+def named_in(header: Sequence[str], joint: str) -> str:
+    """Return the column of the name of a joint, or the only one for values with it."""
+    low = joint.lower()
+    same = [each for each in header if each.lower() == low]
+    longer = [each for each in header if low in each.lower() and not {*words_of(each)} & OTHER]
+    return (same or longer * (len(longer) == 1) or [''])[0]
 
 
 def _only_numbers(header: Sequence[str]) -> bool:
     return bool(header) and all(re.fullmatch(r'-?[\d.]+(e[+-]?\d+)?', name) for name in header)
 
 
+def _nominal(name: str) -> int:
+    """Return -1 for a name that says measured, 1 for nominal."""
+    words = {*words_of(name)}
+    return bool(words & NOMINAL_WORDS) - bool(words & MEASURED_WORDS)
+
+
+def commanded(header: Sequence[str], joints: int) -> str:
+    """Return why q1, q2 ... may be commanded values, with the options; empty if they are not."""
+    like = like_joints([name for name in header if _nominal(name) < 0], joints) if joints else {}
+    if not like:
+        return ''
+    given = ','.join(f'{ours}={as_typed(name)}' for ours, name in like.items())
+    return (
+        f'q1 may be commanded beside {next(iter(like.values())).replace("*", "1")}: give '
+        f'--columns "{given}", or --columns "q*=q*" if it was measured'
+    )
+
+
 def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:
     """Return the names in a header that count the joints, with a star for the number from 1."""
     if _only_numbers(header):
         return {'q*': '#*'}
-    for name, first in product(header, (1, 0)):
+    for name, first in product(sorted(header, key=_nominal), (1, 0)):
         for one in re.finditer(str(first), name):
             before, after = name[: one.start()], name[one.end() :]
             like = [f'{before}{k}{after}' for k in range(first, joints + first)]

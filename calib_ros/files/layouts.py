@@ -20,11 +20,14 @@ import numpy as np
 from calib_ros.errors import LONGEST_NAME, MOST_ENTRIES, ConfigError, UnknownNameError
 from calib_ros.files.vocabulary import (
     ANGLES,
+    IN_TURN,
     JOINT,
     LENGTHS,
     MATRIX,
     NUMBERS,
+    QUATERNION,
     SEPARATORS,
+    TURNS,
     WORDS,
     joint_columns,
 )
@@ -222,10 +225,12 @@ def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> 
     """
     layout = load_layout(preset) if preset else Layout()
     changes = {name: value for name, value in given.items() if value}
-    for name in ('euler', 'quaternion', 'rotation_vector'):
-        if name in changes:  # instead of the preset's way
-            layout = replace(layout, euler='', quaternion='', rotation_vector=False)
     merged = dict(layout.columns)
+    for name in ('euler', 'quaternion', 'rotation_vector'):
+        if name in changes:  # instead of the preset's way, and of its columns
+            layout = replace(layout, euler='', quaternion='', rotation_vector=False)
+            others = (*TURNS, *IN_TURN) if name == 'quaternion' else QUATERNION
+            merged = {ours: theirs for ours, theirs in merged.items() if ours not in others}
     for text in columns:
         known, defined = dict(merged), set[str]()
         for ours, theirs in parse_columns(text):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import ColumnsError, ConfigError, InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import Codes, Columns, check_quaternions, codes_of, lines_in_words
-from calib_ros.files.headers import named_by_option, refuse_separator
+from calib_ros.files.headers import listed, named_by_option, refuse_separator
 from calib_ros.files.vocabulary import (
     COVARIANCE,
     KINDS,
@@ -281,7 +281,7 @@ def _check_header(columns: Columns, joints: int) -> None:
         raise ColumnsError(
             f'{columns.path} has no column {", ".join(missing)}; expected {expected} '
             '(or distance, plane, or location and socket); found '
-            f'{", ".join(found) or "nothing"}. {named_by_option(found, missing, joints)}'
+            f'{listed(found)}. {named_by_option(found, missing, joints)}'
         )
 
 

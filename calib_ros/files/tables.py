@@ -27,10 +27,24 @@ from calib_ros.errors import ColumnsError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import Codes, Columns, columns_of, measured
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.headers import joints_left_out, like_joints, not_read
+from calib_ros.files.headers import (
+    commanded,
+    joints_left_out,
+    like_joints,
+    name_and_unit,
+    not_read,
+)
 from calib_ros.files.journal import columns, of_journal
 from calib_ros.files.measurements import Measurements, distinct_rows, measurements
-from calib_ros.files.vocabulary import MATRIX, QUATERNION, TURNS, WORDS, joint_columns
+from calib_ros.files.names import in_doubt, quaternions_in, turns_in
+from calib_ros.files.vocabulary import (
+    MATRIX,
+    POSITION,
+    QUATERNION,
+    TURNS,
+    WORDS,
+    joint_columns,
+)
 from calib_ros.kinematics.se3 import Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.dataset import Dataset, dataset_of
@@ -76,8 +90,14 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
     count = Counter(map(str.lower, found.cells))
     low = {name: name.lower() for name in found.cells if count[name.lower()] == 1}
     meant = {name: ours for name, ours in low.items() if ours in WORDS and ours != name}
+    if not {*QUATERNION} & {*low.values()}:
+        meant |= {name: ours for ours, name in quaternions_in(found.header).items()}
     cells = {meant.get(name, name): given for name, given in found.cells.items()}
     found = replace(found, cells=cells)
+    doubt = in_doubt(found.header, POSITION) if {*POSITION} <= {*cells} else ''
+    doubt = doubt or (commanded(found.header, joints) if 'q1' in cells else '')
+    if doubt:
+        raise ColumnsError(f'{path}: {doubt}')
     kept, skipped = measured(found)
     if skipped:  # of whole rows: others were cut off
         found.block([name for name in joint_columns(joints) if name in cells])
@@ -90,6 +110,8 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
         notes.append(
             f'{path}: {turns} are left out: give --euler or --rotation-vector to use them'
         )
+    turns = turns_in([name_and_unit(name)[0] for name in found.header])
+    notes += [f'{path}: {turns}'] * bool(turns)
     known = {*columns(joints), *TURNS, 'plane', f'q{joints + 1}'}
     return kept, (*notes, *not_read(path, [name for name in cells if name not in known]))
 

@@ -21,7 +21,9 @@ UNIT_SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
 """Units by their signs and words in small letters."""
 _ANY = '|'.join(UNIT_SIGNS)
 _WORDS = '|'.join(sign for sign in UNIT_SIGNS if sign not in ('m', 'in'))
-UNIT = re.compile(rf'(.*[^\s,/_]) *(?:[\[(]([^\[\]()]+)[\])]|[,/] *({_ANY})|[_ ]({_WORDS}))', re.I)
+UNIT = re.compile(
+    rf'(.*[^\s,/_]) *(?:[\[(](?![0-9]+[\])])([^\[\]()]+)[\])]|[,/] *({_ANY})|[_ ]({_WORDS}))', re.I
+)
 """A name with its unit: X [mm], X (mm), X / mm, X_mm; brackets may hold something else."""
 UNITS_ARE = re.compile(
     rf'\bunits?\b(?:\W*[:=]\W*({_ANY})|\W*(?:are )?(?:in )?({_WORDS}))\b(?:\W+({_ANY})\b)?', re.I
@@ -47,7 +49,9 @@ MATRIX = tuple(f'r{i}{j}' for i in (1, 2, 3) for j in (1, 2, 3))
 """Rotation matrices, row by row."""
 SIGMAS = ('sx', 'sy', 'sz', 'srx', 'sry', 'srz')
 """Standard deviations of x y z, and of rx ry rz (or about x y z of the device)."""
-WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand', 'stamp_ns')  # as text
+SOCKETS = ('location', 'socket', 'plane')
+WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand', 'stamp_ns', *SOCKETS)
+"""Columns of text."""
 NUMBERS = (*POSE_COLUMNS, *TURNS, *IN_TURN, *MATRIX, *SIGMAS, 'distance', 'time', 'delay')
 JOINT = re.compile('[qsva][0-9]+')
 """Columns with a number of each joint: values, signs of last moves, and rates."""

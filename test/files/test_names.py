@@ -1,0 +1,197 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Columns whose names tell measured from nominal values, and which rotations they hold."""
+
+import re
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from test_foreign import JOINTS, NAMES, PLACES, PLAIN, TURNED, assert_same, text_of
+
+from calib_ros import Chain, Settings, read_table
+from calib_ros.errors import ColumnsError, InputError
+from calib_ros.files import loading
+from calib_ros.files.foreign import Foreign
+from calib_ros.files.layouts import Layout, layout_of
+from calib_ros.kinematics.chain import Joint
+
+ARM = Chain('arm', 'standard', (Joint('shoulder'), Joint('elbow')))
+NOMINAL = PLACES + 0.25
+QUATERNIONS = TURNED.as_quat()
+
+
+def read(path, **given):
+    return loading.table(path, ARM, Settings(), foreign=Foreign(layout_of(**given), ARM))
+
+
+def names(form):
+    return [form.format(axis) for axis in 'XYZ']
+
+
+def proposed(path, said='.*'):
+    """Return the table with the first option that the message proposes."""
+    given, foreign = [], None
+    for _ in range(2):
+        with pytest.raises(InputError, match=said) as err:
+            loading.table(path, ARM, Settings(), foreign=foreign)
+        given.append(re.search('--columns "([^"]*)"', str(err.value))[1])
+        assert 'NAME' not in given[-1], err.value
+        foreign, said = Foreign(layout_of('', given, {}), ARM), '.*'
+        with suppress(ColumnsError):
+            return loading.table(path, ARM, Settings(), foreign=foreign)
+    raise AssertionError(given)
+
+
+@pytest.mark.parametrize(
+    ('first', 'second'),
+    [
+        ('{}_nom', '{}_meas'),
+        ('Nominal {}', 'Actual {}'),
+        ('{} Soll', '{} Ist'),
+        ('{} Nom', '{} Act'),
+        ('{} (nominal)', '{} (measured)'),
+        ('tcp.{}', 'leica.point.{}'),
+        ('{}', '{}_meas'),
+        ('{}', 'Actual {}'),
+        ('{}', 'Tracker {}'),
+    ],
+)
+@pytest.mark.parametrize('joints', [['q1', 'q2'], ['J1', 'J2']])
+def test_nominal_coordinates_are_never_taken_for_measured_ones(tmp_path, first, second, joints):
+    """Plain names beside measured ones were, without a word."""
+    path = tmp_path / 'cell.csv'
+    header = [*joints, *names(first), *names(second)]
+    path.write_text(text_of(JOINTS, NOMINAL, PLACES, names=header))
+    assert_same(proposed(path), None)
+    path.write_text(text_of(JOINTS, PLACES, NOMINAL, names=[*joints, *header[5:], *header[2:5]]))
+    assert_same(proposed(path), None)
+
+
+@pytest.mark.parametrize('form', ['{}_nom', '{} (nominal)', 'Commanded {}', 'd{}'])
+def test_nominal_coordinates_alone_are_not_proposed(tmp_path, form):
+    path = tmp_path / 'cell.csv'
+    path.write_text(text_of(JOINTS, NOMINAL, names=['q1', 'q2', *names(form)]))
+    with pytest.raises(InputError, match='--columns "x=NAME,y=NAME,z=NAME"'):
+        loading.table(path, ARM, Settings())
+
+
+def test_deviations_tell_that_plain_coordinates_may_be_nominal(tmp_path):
+    path = tmp_path / 'cell.csv'
+    columns = JOINTS, NOMINAL, PLACES - NOMINAL
+    path.write_text(text_of(*columns, names=[*NAMES, 'dx', 'dy', 'dz']))
+    assert_same(proposed(path, '"x=x,y=y,z=z" if they were measured'), None)
+    path.write_text(text_of(*columns, names=['J1', 'J2', *names('{}'), *names('d{}')]))
+    assert_same(proposed(path, '"x=X,y=Y,z=Z" if they were measured'), None)
+    measured = JOINTS, PLACES, NOMINAL, PLACES - NOMINAL
+    given = [*NAMES, *names('{}_nom'), 'dx', 'dy', 'dz']
+    path.write_text(text_of(*measured, names=given))
+    assert_same(read_table(path, 2), None)
+    for apart in ('s{}', '{}_std', '{}_vel'):  # other quantities
+        path.write_text(text_of(*columns, names=[*NAMES, *(apart.format(a) for a in 'xyz')]))
+        assert len(loading.table(path, ARM, Settings()).fitted[0]) == 3
+
+
+@pytest.mark.parametrize(
+    ('first', 'second'),
+    [('q{}_cmd', 'q{}_act'), ('q{}', 'q{}_meas'), ('target_q_{}', 'actual_q_{}')],
+)
+def test_commanded_joints_are_not_taken_for_measured_ones(tmp_path, first, second):
+    path = tmp_path / 'cell.csv'
+    given = [form.format(k) for form in (first, second) for k in (1, 2)]
+    path.write_text(text_of(JOINTS + 0.01, JOINTS, PLACES, names=[*given, *NAMES[2:]]))
+    assert_same(proposed(path), None)
+
+
+@pytest.mark.parametrize('form', ['quat_{}', 'Quat {}', 'q_{}', 'orientation.{}', 'rot_{}'])
+def test_quaternions_are_read_by_their_names(tmp_path, form):
+    """They were left out with a note."""
+    path = tmp_path / 'cell.csv'
+    given = [*NAMES, *(form.format(axis) for axis in 'xyzw')]
+    path.write_text(text_of(JOINTS, PLACES, QUATERNIONS, names=given))
+    for foreign in (None, Foreign(Layout(), ARM)):
+        table = read_table(path, 2, foreign=foreign)
+        assert_same(table)
+        assert any('qx' in note for note in table.warnings)
+    for other in ('nominal_', 'tool2_'):
+        given = [*NAMES, *(other + form.format(axis) for axis in 'xyzw')]
+        path.write_text(text_of(JOINTS, PLACES, QUATERNIONS, names=given))
+        assert not read_table(path, 2).fitted[0].oriented.any()
+
+
+@pytest.mark.parametrize('prefix', ['pose.', '/leica/long/name/of/the/topic/pose/'])
+def test_a_pose_of_ros_is_proposed(tmp_path, prefix):
+    path = tmp_path / 'cell.csv'
+    given = [f'/joint_states/{joint}/position' for joint in ARM.joint_names]
+    given += [f'{prefix}position.{axis}' for axis in 'xyz']
+    given += [f'{prefix}orientation.{axis}' for axis in 'xyzw']
+    path.write_text(text_of(JOINTS, PLACES, QUATERNIONS, names=given))
+    assert_same(proposed(path))
+    given[:2] = '/joint_states/position[0]', '/joint_states/position[1]'
+    path.write_text(text_of(JOINTS, PLACES, QUATERNIONS, names=given))
+    assert_same(proposed(path))
+
+
+@pytest.mark.parametrize(
+    ('angles', 'option'),
+    [
+        ('Roll,Pitch,Yaw', 'rx=Roll,ry=Pitch,rz=Yaw" --euler xyz'),
+        ('A [deg],B [deg],C [deg]', 'r1=A,r2=B,r3=C" --euler ZYX'),
+        ('W,P,R', 'rx=W,ry=P,rz=R" --euler xyz'),
+    ],
+)
+def test_the_option_for_angles_is_told(tmp_path, angles, option):
+    path = tmp_path / 'cell.csv'
+    given = [*NAMES, *angles.split(',')]
+    unit = 180 / np.pi if 'deg' in angles else 1.0
+    turned = TURNED.as_euler(option[-3:]) * unit
+    path.write_text(text_of(JOINTS, PLACES, turned, names=given))
+    (note,) = (note for note in loading.table(path, ARM, Settings()).warnings if option in note)
+    columns, euler = re.search('--columns "(.*)" --euler (.*)', note).groups()
+    assert_same(
+        read(path, preset='', columns=[columns], given={'euler': euler, 'joint_angle': 'rad'})
+    )
+
+
+def test_numbers_as_names_of_columns_are_no_values(tmp_path):
+    """The proposal q*=* gave the joints 1, 2 ... as constants."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(text_of(JOINTS, PLACES, names=['1', '2', 'x', 'y', 'z']))
+    assert_same(proposed(path), None)
+
+
+def test_another_form_of_rotations_replaces_the_columns_of_a_preset(tmp_path):
+    """`--preset vicon --rotation-vector` missed the column RW."""
+    path = tmp_path / 'cell.csv'
+    given = ['A1', 'A2', 'RX', 'RY', 'RZ', 'TX', 'TY', 'TZ']
+    path.write_text(text_of(JOINTS, TURNED.as_rotvec(), PLACES, names=given))
+    units = {'length': 'm', 'rotation_vector': True}
+    assert_same(read(path, preset='vicon', columns=['q*=A*'], given=units))
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'q1,q2,plane\n0.1,0.2,table\n0.2,0.3,table\n0.4,0.3,table\n',
+        'q1,q2,location,socket\n0.1,0.2,a,1\n0.2,0.3,a,1\n0.4,0.3,a,2\n',
+    ],
+)
+def test_touched_places_are_read_as_other_tables_are(tmp_path, text):
+    path, other = tmp_path / 'cell.csv', tmp_path / 'other.csv'
+    path.write_text(text)
+    other.write_text(text.replace(',', ';').replace('q1', 'Q1'))
+    known = read_table(path, 2).fitted
+    for found in (
+        read_table(path, 2, foreign=Foreign(Layout())).fitted,
+        loading.table(other, ARM, Settings()).fitted,
+    ):
+        assert [str(each) for each in found] == [str(each) for each in known]
+        for one, same in zip(known, found, strict=True):
+            np.testing.assert_array_equal(one.joints, same.joints)
+
+
+def test_a_location_may_be_anything(tmp_path):
+    path = tmp_path / 'cell.csv'
+    lines = PLAIN.splitlines()
+    path.write_text('\n'.join([f'{lines[0]},Location', *(f'{each},hall 2' for each in lines[1:])]))
+    assert_same(read_table(path, 2, foreign=Foreign(Layout())), None)
