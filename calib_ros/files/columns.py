@@ -25,7 +25,6 @@ from calib_ros.files.headers import refuse_separator
 from calib_ros.files.vocabulary import (
     DECIMAL_COMMA,
     IN_ORDER,
-    MEASURED_COLUMNS,
     MISSING,
     THOUSANDS,
 )
@@ -87,10 +86,10 @@ class Columns:
         if commas := DECIMAL_COMMA.fullmatch(bare) is not None:
             told = f'; if these are thousands, {remedy}' * bool(THOUSANDS.fullmatch(bare))
             remedy = f'write a point or, of measurements, give --decimal comma{told}'
-        of_units = row == 0 and bare.lower() not in MISSING and not re.search('[0-9]', bare)
-        if of_units:  # perhaps, as other tables have below their header
+        words = bare.lower() not in MISSING and not re.search('[0-9]', bare)
+        if words and row == 0:  # perhaps, as other tables have below their header
             remedy += '; units belong into the header: q1 [deg]'
-        return (ColumnsError if of_units or (commas and not row) else InputError)(
+        return (ColumnsError if words or (commas and not row) else InputError)(
             f'{self.where(row, called)} must be a finite number, not {text!r}: {remedy}'
         )
 
@@ -361,17 +360,6 @@ def check_quaternions(columns: Columns, quat: FloatArray) -> None:
 def lines_in_words(lines: Sequence[int]) -> str:
     """Return the numbers of the first lines as text."""
     return f'line{"s" if len(lines) > 1 else ""} {", ".join(some(list(map(str, lines))))}'
-
-
-def measured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
-    """Return the rows in which something was measured, and a note about the others."""
-    blank = [made.blank(name) for name in MEASURED_COLUMNS if name in made.cells]
-    if not blank or not (empty := np.logical_and.reduce(blank)).any():
-        return made, ()
-    left = lines_in_words(made.lines[empty].tolist())
-    if empty.all():
-        raise InputError(f'{made.path}: nothing measured in {left}: rows need x, y, z or distance')
-    return made.select(~empty), (f'{made.path}: nothing measured in {left}: skipped',)
 
 
 def as_csv(columns: Columns) -> str:

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.columns import Columns, cell_number, measured
+from calib_ros.files.columns import Columns, cell_number
 from calib_ros.files.conventions import finished
 from calib_ros.files.headers import (
     commanded,
@@ -40,6 +40,7 @@ from calib_ros.files.names import (
     turns_in,
 )
 from calib_ros.files.sheets import read_sheet
+from calib_ros.files.skipped import measured, without_statistics
 from calib_ros.files.units import Units
 from calib_ros.files.vocabulary import (
     IN_TURN,
@@ -164,7 +165,9 @@ class _Table:
         if not alone:
             own |= {name: name for name in (*NUMBERS, *WORDS)}
         self._sheet = read_sheet(path, layout, list(needed), list(own))
-        self.notes, self.count = list(self._sheet.notes), len(self._sheet.columns.lines)
+        kept, left = without_statistics(self._sheet.columns)
+        self._sheet, self.count = replace(self._sheet, columns=kept), len(kept.lines)
+        self.notes = [*self._sheet.notes, *left]
         self._columns = self._asked(asked, optional)
         if not alone:
             own |= {name: ours for ours, name in quaternions_in(self.names).items()}

@@ -42,6 +42,7 @@ from calib_ros.texts import LARGEST_TABLE, read_bytes
 
 HEAD_LINES = MOST_ENTRIES // 10
 """Lines searched for the header and the first row of numbers."""
+COMMENTS = ('#', '%', '//')
 LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
 
 
@@ -156,15 +157,38 @@ def _sheet(
     if at < 0 and first:  # columns by their numbers
         header = tuple(f'#{k + 1}' for k in range(len(head[first][1])))
     header = _with_units(header, [cells for _, cells in head[at + 1 : first]])
-    above = [' '.join(cells) for _, cells in head[: first if at < 0 else at]]
-    body = chain([whole[first:]], rows)
+    above = ['\t'.join(cells) for _, cells in head[: first if at < 0 else at]]
+    left: list[int] = []
+    body = _without_words(chain([whole[first:]], rows), head[at:first], left)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
     if at >= 0 and max(used, default=0) < len(header):
         _refuse_shifted(columns, len(header))
+    if left:
+        notes.append(f'there are no numbers in {lines_in_words(left)}: skipped')
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(
         path, header, (*content.comments, *above), replace(columns, decimal=decimal), tuple(notes)
     )
+
+
+def _without_words(
+    blocks: Iterable[list[Cells]], head: Sequence[Cells], left: list[int]
+) -> Iterator[list[Cells]]:
+    """Yield the rows but comments, remarks and the `head` again, whose lines go into a list."""
+    again = [cells for _, cells in head]
+    for block in blocks:
+        words = [
+            line
+            for line, cells in block
+            if (
+                len(cells) - cells.count('') <= 2
+                or cells[0].startswith(COMMENTS)
+                or cells in again
+            )
+            and not any(_is_number(cell, ',') for cell in cells)
+        ]
+        left += words
+        yield [row for row in block if row[0] not in words] if words else block
 
 
 def _refuse_shifted(columns: Columns, width: int) -> None:

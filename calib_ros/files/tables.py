@@ -25,7 +25,7 @@ import numpy as np
 from calib_ros.annotated import Count, Positive, as_annotated
 from calib_ros.errors import ColumnsError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files.columns import Codes, Columns, columns_of, measured
+from calib_ros.files.columns import Codes, Columns, columns_of
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.headers import (
     commanded,
@@ -37,6 +37,7 @@ from calib_ros.files.headers import (
 from calib_ros.files.journal import columns, of_journal
 from calib_ros.files.measurements import Measurements, distinct_rows, measurements
 from calib_ros.files.names import in_doubt, quaternions_in, turns_in
+from calib_ros.files.skipped import measured, without_statistics
 from calib_ros.files.vocabulary import (
     MATRIX,
     POSITION,
@@ -98,13 +99,14 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
     doubt = doubt or (commanded(found.header, joints) if 'q1' in cells else '')
     if doubt:
         raise ColumnsError(f'{path}: {doubt}')
+    found, left = without_statistics(found)
     kept, skipped = measured(found)
     if skipped:  # of whole rows: others were cut off
         found.block([name for name in joint_columns(joints) if name in cells])
     if {*MATRIX} <= {*cells}:
         raise ColumnsError(f'{path} has rotation matrices: calib_ros import makes quaternions')
     notes = [f'{path}: the column {name} is read as {ours}' for name, ours in meant.items()]
-    notes += (*skipped, *joints_left_out(path, found.header, joints))
+    notes += (*left, *skipped, *joints_left_out(path, found.header, joints))
     if {*TURNS} <= {*cells} and QUATERNION[0] not in cells:
         turns = ', '.join(TURNS)
         notes.append(

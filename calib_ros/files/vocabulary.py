@@ -26,7 +26,7 @@ UNIT = re.compile(
 )
 """A name with its unit: X [mm], X (mm), X / mm, X_mm; brackets may hold something else."""
 UNITS_ARE = re.compile(
-    rf'\bunits?\b(?:\W*[:=]\W*({_ANY})|\W*(?:are )?(?:in )?({_WORDS}))\b(?:\W+({_ANY})\b)?', re.I
+    rf'\bunits?\b(?:\W*[:=\t]\W*({_ANY})|\W*(?:are )?(?:in )?({_WORDS}))\b(?:\W+({_ANY})\b)?', re.I
 )
 """Units in words: `Length Units = m`, `Units: mm, deg`, `units are in mm`."""
 SECONDS = ('', 's', 'sec', 'second', 'seconds')
@@ -35,6 +35,9 @@ SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'space': ' '}
 DECIMAL_COMMA = re.compile(r'\s*[+\u2212-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
 THOUSANDS = re.compile(r"[+\u2212-]?[1-9][0-9]{0,2}([\s.,'\u2019][0-9]{3})+([.,][0-9]*)?")
 MISSING = frozenset(('', 'nan', '-nan', 'na', 'n/a', '#n/a', '#nv', 'null', 'none', '-', '--'))
+MISSING |= {'---', '----', '***', '?', 'nat', 'n.a.', 'k.a.', 'lost', 'missing', 'undefined'}
+MISSING |= {'nan(ind)', '-nan(ind)', '1.#qnan', '-1.#ind', '1.#ind'}
+MISSING |= {'#value!', '#div/0!', '#ref!', '#name?', '#num!', '#null!', '#wert!', '#bezug!'}
 """Cells without a value, in small letters."""
 SHEETS = ('.xlsx', '.xlsm')
 

@@ -1,0 +1,109 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Rows that are no measurements: statistics, lost targets, remarks and headers again."""
+
+import pytest
+from test_foreign import PLAIN, assert_same
+
+from calib_ros import Chain, Settings, read_table
+from calib_ros.errors import InputError
+from calib_ros.files import loading
+from calib_ros.files.foreign import Foreign
+from calib_ros.files.layouts import Layout
+from calib_ros.kinematics.chain import Joint
+
+ARM = Chain('arm', 'standard', (Joint('a'), Joint('b')))
+NAMED = PLAIN.replace('q1', 'point,q1', 1).replace('\n', '\np,', 3)
+
+
+def tables(path):
+    """Yield the table read as ours, as that of another system, and either."""
+    yield loading.table(path, ARM, Settings())
+    yield read_table(path, 2, foreign=Foreign(Layout(), ARM))
+
+
+@pytest.mark.parametrize(
+    'rows',
+    [
+        ('Mean,0.1,0.2,0.3,0.4,0.5',),
+        ('Mean:,0.1,0.2,0.3,0.4,0.5', 'Std. Dev.,1,1,1,1,1', 'max,1,1,1,1,1', 'RMS,1,1,1,1,1'),
+        ('Mittelwert,,,0.3,0.4,0.5', 'Standardabweichung,,,1,1,1'),
+    ],
+)
+def test_statistics_below_a_table_are_no_poses(tmp_path, rows):
+    path = tmp_path / 'cell.csv'
+    path.write_text(NAMED + '\n'.join(rows) + '\n')
+    for table in tables(path):
+        assert_same(table, None)
+        assert any('statistics in line' in note for note in table.warnings)
+
+
+def test_a_name_that_comes_again_is_no_statistic(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text(NAMED.replace('\np,', '\nmax,'))
+    for table in tables(path):
+        assert_same(table, None)
+
+
+@pytest.mark.parametrize('lost', ['0', '0.000', '-9999', '-9999.0', '99999', '-99999,'])
+def test_a_lost_target_is_no_position(tmp_path, lost):
+    path = tmp_path / 'cell.csv'
+    semicolons = lost.endswith(',')
+    text = f'{PLAIN}0.2,0.3,' + ','.join([lost.rstrip(',')] * 3) + '\n'
+    path.write_text(text.replace(',', ';') if semicolons else text)
+    for table in tables(path):
+        assert_same(table, None)
+        assert any('no target (x = y = z) in line 5' in note for note in table.warnings)
+    path.write_text(f'{PLAIN}0.2,0.3,0.0,-9999,0.0\n')
+    assert len(read_table(path, 2).fitted[0]) == 4
+    path.write_text('q1,q2,x,y,z\n' + '0.2,0.3,0,0,0\n' * 3)
+    with pytest.raises(InputError, match='no target'):
+        read_table(path, 2)
+
+
+def test_lost_targets_are_known_in_any_unit(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text(f'{PLAIN}0.2,0.3,-9999,-9999,-9999\n'.replace('x,y,z', 'x [mm],y [mm],z [mm]'))
+    (found,) = read_table(path, 2, foreign=Foreign(Layout())).fitted
+    assert len(found) == 3
+
+
+@pytest.mark.parametrize(
+    'row',
+    [
+        '# moved the target',
+        '% moved it, again',
+        '// lost',
+        'End of file',
+        'Operator: Smith, 3 Nov',
+        'q1,q2,x,y,z',
+        'rad,rad,m,m,m',
+        '----',
+    ],
+)
+@pytest.mark.parametrize('place', [2, 3])
+def test_remarks_and_headers_again_are_no_rows(tmp_path, row, place):
+    """Each was refused, as a value that is no number."""
+    path = tmp_path / 'cell.csv'
+    lines = PLAIN.replace('z\n', 'z\nrad,rad,m,m,m\n', 1).splitlines()
+    lines.insert(place + 2, row)
+    path.write_text('\n'.join(lines) + '\n')
+    for table in tables(path):
+        assert_same(table, None)
+        assert any(f'line {place + 3}' in note for note in table.warnings)
+
+
+def test_a_row_of_words_in_place_of_numbers_is_refused(tmp_path):
+    path = tmp_path / 'cell.csv'
+    for row in ('a,b,c,d,e', '0.1,b,1,2,3', 'q2,q1,x,y,z'):
+        path.write_text(f'{PLAIN}{row}\n')
+        with pytest.raises(InputError, match=r'line 5: .* must be a finite number'):
+            loading.table(path, ARM, Settings())
+
+
+@pytest.mark.parametrize('cell', ['---', '***', '#VALUE!', '1.#QNAN', '-nan(ind)', 'lost', 'n.a.'])
+def test_cells_without_a_value_are_empty(tmp_path, cell):
+    path = tmp_path / 'cell.csv'
+    path.write_text(f'{PLAIN}0.2,0.3,{cell},{cell},{cell}\n')
+    for table in tables(path):
+        assert_same(table, None)
