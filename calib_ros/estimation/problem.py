@@ -110,7 +110,7 @@ class Problem(Shown):
                 )
             self._check_held(observations)
             if observations.distances is not None:
-                self._check_distances(observations.distances)
+                self._check_distances(observations.distances, observations.joints)
             if observations.pixels is not None:
                 require_lens(self.model.frame(observations.camera).lens, observations.camera)
         sockets = {each.base for each in self.sets if each.socket}
@@ -130,12 +130,12 @@ class Problem(Shown):
                     f'are {value:.4g} in the chain file, and no coupling moves it'
                 )
 
-    def _check_distances(self, distances: FloatArray) -> None:
-        """Refuse distances that vary by more than the flange can move.
+    def _check_distances(self, distances: FloatArray, joints: FloatArray) -> None:
+        """Refuse distances that vary by more than the flange can move, and turns of many joints.
 
-        By their quartiles: some may be gross errors.
+        By their quartiles: some may be gross errors, or of an endless axis.
         """
-        reach = TOOL
+        reach, doubts = TOOL, []
         for joint in self.chain.joints:
             reach += joint.apart + abs(joint.d)
             if joint.type == 'prismatic':
@@ -143,10 +143,18 @@ class Problem(Shown):
                 reach += max(np.inf if end is None else abs(end) for end in ends)
         spread = float(np.ptp(np.percentile(distances, (25.0, 75.0)))) if len(distances) else 0.0
         if spread > 2.0 * reach:
-            raise InputError(
+            doubts.append(
                 f'the distances vary by {spread:.3g} m, more than an arm of {reach - TOOL:.3g} m '
                 'can cause: are they in metres (--length)?'
             )
+        turns = np.abs(joints[:, [joint.type != 'prismatic' for joint in self.chain.joints]])
+        if turns.size and np.percentile(turns, 75.0) > 2.0 * np.pi:
+            doubts.append(
+                'many joint values are beyond a whole turn: are they in degrees '
+                '(--joint-angle deg)?'
+            )
+        if doubts:
+            raise InputError(' '.join(doubts))
 
     def _check_patterns(self) -> None:
         for pattern in (*self.fixed, *self.priors):

@@ -15,6 +15,7 @@ from calib_ros.files.names import (
     NOMINAL_WORDS,
     OTHER,
     as_typed,
+    is_distance,
     positions_in,
     quaternions_in,
     words_of,
@@ -128,6 +129,9 @@ def named_by_option(
         found = (like or {'q*': 'NAME*'}) | more_of
     if {*POSITION} <= {*missing} and found[POSITION[0]] != 'NAME':
         found |= quaternions_in(header, sure=False)
+    elif {*POSITION} <= {*missing} and len(wires := [*filter(is_distance, header)]) == 1:
+        found = {n: each for n, each in found.items() if n not in POSITION}
+        found['distance'] = wires[0]
     given = ','.join(f'{name}={as_typed(each)}' for name, each in found.items())
     if len(given) > LONGEST // 3:  # a message would lose its middle
         short = {each: f'#{header.index(each) + 1}' for each in found.values() if each in header}

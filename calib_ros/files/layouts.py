@@ -230,7 +230,11 @@ def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> 
         if name in changes:  # instead of the preset's way, and of its columns
             layout = replace(layout, euler='', quaternion='', rotation_vector=False)
             others = (*TURNS, *IN_TURN) if name == 'quaternion' else QUATERNION
-            merged = {ours: theirs for ours, theirs in merged.items() if ours not in others}
+            merged = {
+                ours: theirs
+                for ours, theirs in merged.items()
+                if ours not in others or '#' in theirs
+            }
     for text in columns:
         known, defined = dict(merged), set[str]()
         for ours, theirs in parse_columns(text):

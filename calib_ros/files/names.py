@@ -54,6 +54,7 @@ DEVIATION = frozenset(
     ('d', 'dev', 'deviation', 'delta', 'dif', 'diff', 'difference', 'abw', 'abweichung')
 )
 TURNED = frozenset(('q', 'quat', 'quaternion', 'orientation', 'rot', 'rotation'))
+DISTANCE_WORDS = frozenset(('distance', 'length', 'wire', 'abstand'))
 OTHER = frozenset(
     (
         'r',
@@ -119,6 +120,12 @@ def _one(found: Sequence[tuple[frozenset[str], dict[str, str]]]) -> list[str]:
         if len(some) == 1:
             return [*some[0][1].values()]
     return []
+
+
+def is_distance(name: str) -> bool:
+    """Tell whether a name is that of a measured distance."""
+    words = {*words_of(name)}
+    return bool(words & DISTANCE_WORDS) and not words & (NOMINAL_WORDS | DEVIATION | OTHER)
 
 
 def positions_in(header: Sequence[str], missing: Sequence[str] = POSITION) -> dict[str, str]:

@@ -219,3 +219,16 @@ def test_distances_that_no_arm_moves_by_are_no_metres(rng, unit):
     typo = seen.distances.copy()
     typo[::6] *= unit
     Problem(UR10E, replace(seen, distances=typo), **SIGMAS)  # gross errors are for the fit
+
+
+def test_joint_values_in_degrees_are_told_beside_distances(rng):
+    """The fit ended with 830 mm, and told to check the chain first."""
+    seen = wire(faulty(UR10E, Cell(), rng), 60, rng, noise=NOISE[0])
+    wrong = replace(seen, joints=np.degrees(seen.joints))
+    with pytest.raises(InputError, match=r'^many joint values .* \(--joint-angle deg\)'):
+        Problem(UR10E, wrong, **SIGMAS)
+    with pytest.raises(InputError, match=r'\(--length\)\? many .* \(--joint-angle deg\)'):
+        Problem(UR10E, replace(wrong, distances=1e3 * seen.distances), **SIGMAS)
+    endless = seen.joints.copy()
+    endless[:, 5] += 20 * np.pi
+    Problem(UR10E, replace(seen, joints=endless), **SIGMAS)

@@ -195,3 +195,20 @@ def test_a_location_may_be_anything(tmp_path):
     lines = PLAIN.splitlines()
     path.write_text('\n'.join([f'{lines[0]},Location', *(f'{each},hall 2' for each in lines[1:])]))
     assert_same(read_table(path, 2, foreign=Foreign(Layout())), None)
+
+
+@pytest.mark.parametrize('name', ['Length [m]', 'Distance to anchor', 'wire (m)'])
+def test_a_distance_is_proposed(tmp_path, name):
+    path = tmp_path / 'cell.csv'
+    path.write_text(text_of(JOINTS, PLACES[:, 0], names=['J1', 'J2', name]))
+    (found,) = proposed(path).fitted
+    np.testing.assert_allclose(found.distances, PLACES[:, 0])
+    path.write_text(text_of(JOINTS, PLACES[:, 0], names=['J1', 'J2', f'nominal {name}']))
+    with pytest.raises(InputError, match='x=NAME,y=NAME,z=NAME'):
+        loading.table(path, ARM, Settings())
+
+
+def test_numbered_columns_of_a_preset_are_of_its_own_form(tmp_path):
+    """Angles of Motive are three columns, and the position comes one earlier."""
+    layout = layout_of('optitrack', [], {'euler': 'XYZ'})
+    assert layout.columns['qx'] == '#3'
