@@ -154,7 +154,7 @@ class Problem(Shown):
                 '(--joint-angle deg)?'
             )
         if doubts:
-            raise InputError(' '.join(doubts))
+            raise InputError(' Also, '.join(doubts))
 
     def _check_patterns(self) -> None:
         for pattern in (*self.fixed, *self.priors):

@@ -11,7 +11,9 @@ from pathlib import Path
 
 from calib_ros.errors import LONGEST, ColumnsError, InputError, shortened
 from calib_ros.files.names import (
+    JOINT_WORDS,
     MEASURED_WORDS,
+    NO_JOINT,
     NOMINAL_WORDS,
     OTHER,
     as_typed,
@@ -152,15 +154,16 @@ def _only_numbers(header: Sequence[str]) -> bool:
     return bool(header) and all(re.fullmatch(r'-?[\d.]+(e[+-]?\d+)?', name) for name in header)
 
 
-def _nominal(name: str) -> int:
-    """Return -1 for a name that says measured, 1 for nominal."""
+def _rank(name: str) -> int:
+    """Return -1 for a measured joint by its name, 1 for a nominal one, 2 and more for others."""
     words = {*words_of(name)}
-    return bool(words & NOMINAL_WORDS) - bool(words & MEASURED_WORDS)
+    other = not words & JOINT_WORDS or bool(words & NO_JOINT)
+    return bool(words & NOMINAL_WORDS) - bool(words & MEASURED_WORDS) + 3 * other
 
 
 def commanded(header: Sequence[str], joints: int) -> str:
     """Return why q1, q2 ... may be commanded values, with the options; empty if they are not."""
-    like = like_joints([name for name in header if _nominal(name) < 0], joints) if joints else {}
+    like = like_joints([name for name in header if _rank(name) < 0], joints) if joints else {}
     if not like:
         return ''
     given = ','.join(f'{ours}={as_typed(name)}' for ours, name in like.items())
@@ -174,7 +177,9 @@ def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:
     """Return the names in a header that count the joints, with a star for the number from 1."""
     if _only_numbers(header):
         return {'q*': '#*'}
-    for name, first in product(sorted(header, key=_nominal), (1, 0)):
+    for name, first in product(
+        sorted(header, key=lambda each: (_rank(each), len(words_of(each)))), (1, 0)
+    ):
         for one in re.finditer(str(first), name):
             before, after = name[: one.start()], name[one.end() :]
             like = [f'{before}{k}{after}' for k in range(first, joints + first)]

@@ -11,79 +11,27 @@ from calib_ros.files.vocabulary import POSITION, QUATERNION
 
 WORD = re.compile(r'[^\W\d_A-Z]+|[A-Z][^\W\d_A-Z]+|[A-Z]+(?![a-z])|[0-9]+')
 """Words of a name: `X_meas`, `pose.position.x`, `dX`, `Nominal X`."""
-MEASURED_WORDS = frozenset(
-    (
-        'meas',
-        'measured',
-        'measurement',
-        'act',
-        'actual',
-        'ist',
-        'istwert',
-        'tracker',
-        'leica',
-        'laser',
-        'faro',
-        'vicon',
-    )
+
+
+def _set(words: str) -> frozenset[str]:
+    return frozenset(words.split())
+
+
+MEASURED_WORDS = _set(
+    'meas measured measurement act actual ist istwert fbk feedback tracker leica laser faro vicon'
 )
-NOMINAL_WORDS = frozenset(
-    (
-        'nom',
-        'nominal',
-        'cmd',
-        'command',
-        'commanded',
-        'target',
-        'soll',
-        'sollwert',
-        'ref',
-        'reference',
-        'desired',
-        'setpoint',
-        'theoretical',
-        'cad',
-        'programmed',
-        'planned',
-        'tcp',
-        'robot',
-        'fk',
-    )
+NOMINAL_WORDS = _set(
+    'nom nominal cmd command commanded target soll sollwert ref reference des desired goal '
+    'setpoint theo theoretical ideal cad design model calc computed pred predicted sim simulated '
+    'prog programmed planned tcp ee robot fk'
 )
-DEVIATION = frozenset(
-    ('d', 'dev', 'deviation', 'delta', 'dif', 'diff', 'difference', 'abw', 'abweichung')
-)
-TURNED = frozenset(('q', 'quat', 'quaternion', 'orientation', 'rot', 'rotation'))
-DISTANCE_WORDS = frozenset(('distance', 'length', 'wire', 'abstand'))
-OTHER = frozenset(
-    (
-        'r',
-        's',
-        'u',
-        'v',
-        'a',
-        'f',
-        'std',
-        'stdev',
-        'sd',
-        'sigma',
-        'err',
-        'error',
-        'rms',
-        'var',
-        'uncertainty',
-        'vel',
-        'velocity',
-        'acc',
-        'acceleration',
-        'force',
-        'torque',
-        'twist',
-        'angular',
-        'angle',
-        'euler',
-        'effort',
-    )
+DEVIATION = _set('d dev deviation delta dif diff difference abw abweichung')
+TURNED = _set('q quat quaternion orientation rot rotation')
+DISTANCE_WORDS = _set('distance length wire abstand')
+JOINT_WORDS = _set('q j a joint joints axis achse axe position pos theta th angle')
+NO_JOINT = _set('vel velocity acc acceleration force torque tau effort currents temp temperature')
+OTHER = NO_JOINT | _set(
+    'r s u v a f std stdev sd sigma err error rms var uncertainty twist angular angle euler'
 )
 """Other quantities that have coordinates, too."""
 NO_PLACE = NOMINAL_WORDS | DEVIATION | TURNED | OTHER

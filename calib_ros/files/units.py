@@ -75,7 +75,7 @@ class Units:
                 told = [UNIT_SIGNS.get(word.lower(), '') for word in words]
                 if known := [unit for unit in told if unit in units]:
                     if known[-1] != usual:  # the last: `units: in mm`
-                        self.notes.append(f'{what} are in {known[-1]}, as its head says')
+                        self.notes.append(f'its head gives the unit {known[-1]} of {what}')
                     return known[-1]
         return usual
 

@@ -227,7 +227,7 @@ def test_joint_values_in_degrees_are_told_beside_distances(rng):
     wrong = replace(seen, joints=np.degrees(seen.joints))
     with pytest.raises(InputError, match=r'^many joint values .* \(--joint-angle deg\)'):
         Problem(UR10E, wrong, **SIGMAS)
-    with pytest.raises(InputError, match=r'\(--length\)\? many .* \(--joint-angle deg\)'):
+    with pytest.raises(InputError, match=r'\(--length\)\? Also, many .* \(--joint-angle deg\)'):
         Problem(UR10E, replace(wrong, distances=1e3 * seen.distances), **SIGMAS)
     endless = seen.joints.copy()
     endless[:, 5] += 20 * np.pi

@@ -94,9 +94,21 @@ def test_deviations_tell_that_plain_coordinates_may_be_nominal(tmp_path):
 
 @pytest.mark.parametrize(
     ('first', 'second'),
-    [('q{}_cmd', 'q{}_act'), ('q{}', 'q{}_meas'), ('target_q_{}', 'actual_q_{}')],
+    [
+        ('q{}_cmd', 'q{}_act'),
+        ('q{}', 'q{}_meas'),
+        ('target_q_{}', 'actual_q_{}'),
+        ('tau{}', 'A{}'),
+        ('qd{}', 'th{}'),
+        ('T{}', 'J{}'),
+        ('current_{}', 'joint_{}'),
+        ('joint_current_{}', 'joint_{}'),
+        ('q{}_target', 'q{}_current'),
+        ('velocity_{}', 'position_{}'),
+        ('actual_qd_{}', 'actual_q_{}'),
+    ],
 )
-def test_commanded_joints_are_not_taken_for_measured_ones(tmp_path, first, second):
+def test_other_values_are_not_taken_for_measured_joints(tmp_path, first, second):
     path = tmp_path / 'cell.csv'
     given = [form.format(k) for form in (first, second) for k in (1, 2)]
     path.write_text(text_of(JOINTS + 0.01, JOINTS, PLACES, names=[*given, *NAMES[2:]]))
