@@ -134,6 +134,8 @@ def named_by_option(
     elif {*POSITION} <= {*missing} and len(wires := [*filter(is_distance, header)]) == 1:
         found = {n: each for n, each in found.items() if n not in POSITION}
         found['distance'] = wires[0]
+    if words_of(found.get('x', ''))[1:] in (['m'], ['in']):  # X_in is not read as a unit
+        more = f' --length {words_of(found["x"])[1]}{more}'
     given = ','.join(f'{name}={as_typed(each)}' for name, each in found.items())
     if len(given) > LONGEST // 3:  # a message would lose its middle
         short = {each: f'#{header.index(each) + 1}' for each in found.values() if each in header}

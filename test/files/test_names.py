@@ -224,3 +224,13 @@ def test_numbered_columns_of_a_preset_are_of_its_own_form(tmp_path):
     """Angles of Motive are three columns, and the position comes one earlier."""
     layout = layout_of('optitrack', [], {'euler': 'XYZ'})
     assert layout.columns['qx'] == '#3'
+
+
+def test_a_unit_that_may_be_a_word_is_proposed(tmp_path):
+    """X_in was proposed as metres."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(text_of(JOINTS, PLACES / 0.0254, names=['q1', 'q2', *names('{}_in')]))
+    with pytest.raises(InputError, match='--columns "x=X_in,y=Y_in,z=Z_in" --length in'):
+        loading.table(path, ARM, Settings())
+    given = {'length': 'in'}
+    assert_same(read(path, preset='', columns=['x=X_in,y=Y_in,z=Z_in'], given=given), None)
