@@ -9,7 +9,7 @@ error below NEARER times the original and to that of a faulty arm; so are those 
 as much. If none does, the positions are tried without the orientations, then parts of the rows
 alone, then several mistakes at once.
 
-The typical error is the median over the samples of the distance plus the angle times LEVER.
+The typical error (distance plus angle times LEVER) is that of all but possible gross errors.
 Mistakes without effect cannot be detected: the zero of the first joint is a rotation of the base,
 that of the last joint one of the tool.
 """

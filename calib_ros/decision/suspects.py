@@ -157,8 +157,9 @@ def _of_coordinates(seen: Observations) -> Iterator[Suspect]:
             option = '--columns x={},y={},z={}'.format(*given)
             what = f'the coordinates x, y, z of the positions are {", ".join(given)}'
             changes = (*back, in_axes(matrix), *back)
-            rank = 1 + bool(np.linalg.det(matrix) > 0.0)  # Euler angles' may look so
-            yield Suspect(what, option, changes, rank, part='measured')
+            turned = bool(np.linalg.det(matrix) > 0.0)  # Euler angles' may look so
+            if not np.array_equal(matrix, -np.eye(3)):  # as left-handed axes
+                yield Suspect(what, option, changes, 3 - turned, part='measured')
     for k, name in enumerate('xyz'):
         own = partial(scaled, axis=k)
         for each in _of_lengths(f'{name} coordinates alone', name, own):
@@ -241,10 +242,7 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
     same = np.eye(len(names))
     revolute = [joint.type == 'revolute' for joint in chain.joints]
     for k in range(len(names)):
-        zeros = {'': 0.0, **(QUARTERS if revolute[k] else {})}
-        for sign, (degrees, angle) in product((1.0, -1.0), zeros.items()):
-            if sign < 0.0 or degrees:
-                yield _of_joint(chain, k, sign, degrees, angle)
+        yield from _of_joint(chain, k)
     for i, j in combinations(range(len(names)), 2):
         order = np.arange(len(names))
         order[[i, j]] = j, i
@@ -277,10 +275,12 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
 
 
 def hidden(chain: Chain, others: Sequence[Suspect]) -> list[tuple[Suspect, ...]]:
-    """Return mistakes that hide each other: signs, also with others in hand or order."""
-    signs = [_of_joint(chain, k, -1.0, '', 0.0) for k in range(len(chain.joints))]
+    """Return mistakes that hide each other: of joints, signs also with others in hand or order."""
+    every = [[*_of_joint(chain, k)] for k in range(len(chain.joints))]
+    pairs = [pair for two in combinations(every, 2) for pair in product(*two)]
+    signs = [each[0] for each in every]
     ones = [each for each in others if each.part in FIRST[1:]]
-    return [*combinations(signs, 2), *product(ones, signs), *combinations(signs, 3)]
+    return [*pairs, *product(ones, signs), *combinations(signs, 3)]
 
 
 def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
@@ -295,26 +295,27 @@ def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
             yield Suspect(what, remedy, (change,), 2, part=name)
 
 
-def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> Suspect:
-    """Return that a joint has the other sign, another zero [rad], or both."""
-    parts, column = [], f'q{k + 1}'
-    if sign < 0.0:
-        parts.append(('counts the other way round', f'sign: {-chain.joints[k].sign}'))
-        column = f'-{column}'
-    if degrees:
-        parts.append((f'has its zero {degrees[1:]} degrees away', f'theta {degrees} degrees'))
-        column += f'{degrees[0]}{abs(angle):.16g} ({degrees} if in degrees)'
-    whats, in_file = zip(*parts, strict=True)
-    own = np.eye(len(chain.joints))[k]
-    remedy = f'{" and ".join(in_file)} in the chain file'
-    return Suspect(
-        f'{chain.joint_names[k]} {" and ".join(whats)}',
-        f'{remedy}, or --columns q{k + 1}={column}',
-        (joints_by(np.diag(np.where(own, sign, 1.0)), angle * own),),
-        len(whats),
-        published=remedy,
-        part=chain.joint_names[k],
-    )
+def _of_joint(chain: Chain, k: int) -> Iterator[Suspect]:
+    """Yield that a joint has the other sign, then other zeros, with either sign."""
+    name, column, own = chain.joint_names[k], f'q{k + 1}', np.eye(len(chain.joints))[k]
+    other = ('counts the other way round', f'sign: {-chain.joints[k].sign}')
+    quarters = QUARTERS if chain.joints[k].type == 'revolute' else {}
+    for (degrees, angle), sign in product({'': 0.0, **quarters}.items(), (-1.0, 1.0)):
+        parts, given = [other] * (sign < 0.0), f'{"-" * (sign < 0.0)}{column}'
+        if degrees:
+            parts.append((f'has its zero {degrees[1:]} degrees away', f'theta {degrees} degrees'))
+            given += f'{degrees[0]}{abs(angle):.16g} ({degrees} if in degrees)'
+        if parts:
+            whats, in_file = zip(*parts, strict=True)
+            remedy = f'{" and ".join(in_file)} in the chain file'
+            yield Suspect(
+                f'{name} {" and ".join(whats)}',
+                f'{remedy}, or --columns {column}={given}',
+                (joints_by(np.diag(np.where(own, sign, 1.0)), angle * own),),
+                len(whats),
+                published=remedy,
+                part=name,
+            )
 
 
 def _of_signs(chain: Chain) -> Iterator[Suspect]:

@@ -44,10 +44,10 @@ class Trial:
 
     @cached_property
     def error(self) -> float:
-        """Return the median error [m] of the samples."""
+        """Return the error [m] that a usual share of the samples is within."""
         pairs = zip(self.sets, self.arms, strict=True)
         sizes = [misses(self.chain, each, arm) for each, arm in pairs]
-        return float(np.median(np.concatenate(sizes)))
+        return float(np.quantile(np.concatenate(sizes), 1.0 - MOST_OUTLIERS, method='lower'))
 
     @property
     def share(self) -> float:

@@ -44,7 +44,7 @@ RANKS = {
     'the chain file gives a wrong base (fixed: true)': (3, ''),
     'the chain file gives a wrong tool (fixed: true)': (3, ''),
     'the chain file gives a wrong base and tool (fixed: true)': (3, ''),
-    'the coordinates x, y, z of the positions are -x, y, z': (1, 'measured'),
+    'the coordinates x, y, z of the positions are -x, y, z': (3, 'measured'),
     'the coordinates x, y, z of the positions are y, z, x': (2, 'measured'),
     'the joint values stand 2 rows above their measurement': (2, ''),
 }
@@ -57,6 +57,7 @@ def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
     seen = measure(held, rail.random_joints(20, rng), rng)
     found = {each.what: (each.rank, each.part) for each in suspects(held, (seen,))}
     assert {what: found.get(what) for what in RANKS} == RANKS
+    assert 'the coordinates x, y, z of the positions are -x, -y, -z' not in found  # left-handed
     assert (
         'shoulder_pan_joint is not given against linear_axis_joint: they are coupled' not in found
     )
@@ -66,7 +67,8 @@ def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
     assert 'ur10e' in {each.chain.name for each in others}
 
 
-def test_signs_hide_each_other_in_twos_and_threes_and_behind_another_hand(rng):
+def test_mistakes_of_joints_hide_each_other_and_behind_another_hand(rng):
+    """Of two joints by any sign and zero, of three by their signs."""
     arm = load_chain('ur10e')
     seen = measure(arm, arm.random_joints(5, rng), rng)
     options = [*suspects(arm, (seen,))]
@@ -75,13 +77,21 @@ def test_signs_hide_each_other_in_twos_and_threes_and_behind_another_hand(rng):
     assert coupled == {f'{k} is not given against {j}: they are coupled' for j, k in pairs}
     found = hidden(arm, options)
     others = [each for each in options if each.part in ('handed', 'order')]
-    assert len(found) == 15 + 6 * len(others) + 20
-    flipped = set()
-    for these in (*found[:15], *found[-20:]):
+    two = 15 * 7 * 7
+    assert len(found) == two + 6 * len(others) + 20
+    assert {len(these) for these in found[:-20]} == {2}
+    told = [{each.part for each in these} for these in found[:two]]
+    assert {len(parts) for parts in told} == {2}
+    turned, flipped = set(), set()
+    for these in (*found[:two], *found[-20:]):
         (undone,) = reduce(lambda sets, each: each.undone(sets), these, (seen,))
-        signs = undone.joints / seen.joints
-        assert (np.abs(signs) == 1.0).all()
-        flipped.add(tuple(np.flatnonzero(signs[0] < 0.0)))
+        signs = np.diff(undone.joints, axis=0) / np.diff(seen.joints, axis=0)
+        np.testing.assert_allclose(np.abs(signs), 1.0)
+        zeros = undone.joints[0] - np.sign(signs[0]) * seen.joints[0]
+        turned.add((*np.sign(signs[0]), *np.round(zeros, 6)))
+        if not np.any(np.abs(zeros) > 1e-9):
+            flipped.add(tuple(np.flatnonzero(signs[0] < 0.0)))
+    assert len(turned) == two + 20
     assert flipped == {*combinations(range(6), 2), *combinations(range(6), 3)}
 
 

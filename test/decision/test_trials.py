@@ -34,6 +34,15 @@ def test_gross_errors_do_not_spoil_the_closed_form(count, found):
     assert trial.share == trial.error / trial.spread
 
 
+def test_a_mistake_that_spares_half_of_the_samples_is_not_small():
+    """Poses of two orientations, one of them told wrongly, had a typical error of 2 mm."""
+    chain, seen = with_gross_errors(40, 0)
+    found = trial_of(chain, (seen,))
+    shifts = np.where(np.arange(40) < 16, 0.1, 0.0)[:, np.newaxis]
+    shifted = replace(seen, positions=seen.positions + shifts)
+    assert Trial(found.chain, (shifted,), found.arms).error > 0.1
+
+
 @pytest.mark.parametrize('socket', [False, True])
 def test_the_spread_is_that_of_the_smaller_of_arm_and_measurements(socket):
     """A socket measures no spread at all."""
@@ -50,7 +59,7 @@ def test_gross_errors_do_not_spoil_the_refinement():
     near = trial_of(chain, (seen,)).chain
     off = near.with_offsets({f'base.{axis}': 1e-3 for axis in 'xyz'})
     rough = Trial(off, (seen,), (arm,))
-    assert rough.error == pytest.approx(1e-3 * np.sqrt(3.0))
+    assert rough.error == pytest.approx(1e-3 * np.sqrt(3.0), abs=1e-8)
     turned = Trial(near.with_offsets({'base.rz': 1e-3}), (seen,), (arm,))
     for trial in (rough, turned):
         found = refined(Problem(UR10E, seen, sigma_position=NOISE[0]), trial)
