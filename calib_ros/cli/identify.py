@@ -51,10 +51,8 @@ from calib_ros.settings import Settings
 from calib_ros.shown import of_them, rounded
 from calib_ros.texts import dump_json
 
-RESULT_FILES = (
-    *('calibration.yaml', 'result.json', 'report.html', 'report.md', 'residuals.csv'),
-    *('before_after.png', 'settings.yaml'),
-)
+REPORTS = ('report.html', 'report.md', 'report.pdf', 'residuals.csv', 'before_after.png')
+RESULT_FILES = ('calibration.yaml', 'result.json', 'settings.yaml', *REPORTS)
 OF_UPDATES = ('new_base', 'new_tool')
 NOT_OF_UPDATES = ('history', 'tolerance', 'pdf', 'model', 'fixed', 'priors')
 
@@ -72,7 +70,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if update:
         return _recalibrated(options, screen)
     filed = inputs.history_of(options)
-    with common.output_files(options, (*RESULT_FILES, 'report.pdf')) as contents:
+    with common.output_files(options, RESULT_FILES) as contents:
         found = _identified(options, screen)
         if options.out is not None:
             contents |= result_files(found, screen, options.out, options.pdf)
@@ -96,7 +94,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
-    with common.output_files(options, ('calibration.yaml', 'result.json')) as contents:
+    with common.output_files(options, ('calibration.yaml', 'result.json', *REPORTS)) as contents:
         loaded, _ = _loaded(options, screen)
         common.at_least(options, growth=0)
         previous = inputs.calibration_of(
@@ -371,10 +369,12 @@ def result_files(
 def _set_aside(out: Path, previous: Path | None = None) -> dict[str, bytes]:
     """Return the calibration accepted earlier, if any, under another name.
 
-    The `previous` one, which could not be brought up to date, stays.
+    The `previous` one, which could not be brought up to date, stays with its reports.
     """
     earlier = out / 'calibration.yaml'
     if not earlier.exists():
         return {}
-    stays = previous is not None and earlier.samefile(calibration_file(previous))
-    return {earlier.name if stays else 'calibration.previous.yaml': earlier.read_bytes()}
+    if previous is None or not earlier.samefile(calibration_file(previous)):
+        return {'calibration.previous.yaml': earlier.read_bytes()}
+    kept = [out / name for name in REPORTS if (out / name).exists()]
+    return {each.name: each.read_bytes() for each in (earlier, *kept)}

@@ -46,15 +46,31 @@ def test_the_command_writes_the_calibration_brought_up_to_date(earlier, run, tmp
     status, _, told = run(*given, 'again')
     assert (status, 'again/result.json says why' in told) == (1, True)
     # over what it brings up to date, which is that of the next night too
+    (tmp_path / 'out' / 'report.html').write_text('of what stays')
     assert run(*given, 'out', '--out', 'out', '--force')[0] == 3
     assert (tmp_path / 'out' / 'calibration.yaml').read_text() == text
     assert run(*given, 'out', '--out', 'out', '--force')[0] == 3
+    assert (tmp_path / 'out' / 'report.html').read_text() == 'of what stays'
     # over that of another robot
     assert run(*given, 'out', '--out', 'again', '--force')[0] == 3
     (tmp_path / 'again' / 'calibration.yaml').write_text('another')
     assert run(*given, 'out', '--out', 'again', '--force')[0] == 3
     assert (tmp_path / 'again' / 'calibration.previous.yaml').read_text() == 'another'
     assert not (tmp_path / 'again' / 'calibration.yaml').exists()
+
+
+def test_no_report_of_the_earlier_calibration_stays_beside_its_update(earlier, run, tmp_path):
+    true, previous = earlier
+    (tmp_path / 'out').mkdir()
+    (tmp_path / 'out' / 'calibration.yaml').write_text(previous.dump())
+    for name in ('report.html', 'report.pdf', 'residuals.csv', 'my.txt'):
+        (tmp_path / 'out' / name).write_text('of the earlier one')
+    write_csv(tmp_path / 'few.csv', rows_of(problem(true, 8, 1).observations, 0))
+    given = ['identify', 'few.csv', '--chain', 'ur10e', '--sigma-position', '5e-5']
+    given += ['--sigma-orientation', '2e-4', '--previous', 'out', '--out', 'out', '--force']
+    assert run(*given)[0] == 0
+    found = {each.name for each in (tmp_path / 'out').iterdir()}
+    assert found == {'calibration.yaml', 'result.json', 'my.txt'}
 
 
 def test_the_calibration_of_another_serial_number_is_not_brought_up_to_date(
