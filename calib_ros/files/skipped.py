@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import re
+from itertools import count, takewhile
 
 import numpy as np
 
@@ -58,14 +59,17 @@ def _lost(made: Columns) -> Flags:
 
 def without_statistics(columns: Columns) -> tuple[Columns, tuple[str, ...]]:
     """Return the rows that are not called mean, max and the like at the end, and a note."""
-    kept = np.ones(len(columns.lines), dtype=bool)
+    named = set[int]()  # rows from the end
     for given in columns.cells.values():
         if not isinstance(given, str):
             continue
         last = given[-10 * LONGEST :].lower().split(BETWEEN)  # of many rows
         for row, cell in enumerate(reversed(last), start=1):
             if STATISTIC.fullmatch(cell.strip()) and last.count(cell) == 1:
-                kept[-row] = False
+                named.add(row)
+    kept = np.ones(len(columns.lines), dtype=bool)
+    for row in takewhile(named.__contains__, count(1)):
+        kept[-row] = False
     if kept.all():
         return columns, ()
     left = lines_in_words(columns.lines[~kept].tolist())

@@ -38,9 +38,10 @@ def test_statistics_below_a_table_are_no_poses(tmp_path, rows):
         assert any('statistics in line' in note for note in table.warnings)
 
 
-def test_a_name_that_comes_again_is_no_statistic(tmp_path):
+@pytest.mark.parametrize('count', [1, 3])
+def test_a_name_that_comes_again_or_before_others_is_no_statistic(tmp_path, count):
     path = tmp_path / 'cell.csv'
-    path.write_text(NAMED.replace('\np,', '\nmax,'))
+    path.write_text(NAMED.replace('\np,', '\nmax,', count))
     for table in tables(path):
         assert_same(table, None)
 
