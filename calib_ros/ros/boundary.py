@@ -13,6 +13,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from functools import partial
 from operator import itemgetter
 from typing import Any
@@ -96,7 +97,20 @@ class InOrder(Waitable):  # type: ignore[misc]  # see pyproject.toml
         super().__init__(node.default_callback_group)
         self._services: list[Service] = list(node.services)
         self._places: list[int] = []  # in the wait set
+        self._waited = ExitStack()
         node.add_waitable(self)
+
+    def __enter__(self) -> None:
+        """Keep services from being destroyed while they are waited for; forget those that were."""
+        for each in tuple(self._services):
+            try:
+                self._waited.enter_context(each.handle)
+            except InvalidHandle:
+                self._services.remove(each)
+
+    def __exit__(self, *error: object) -> None:
+        """Let services be destroyed."""
+        self._waited.close()
 
     def __contains__(self, service: object) -> bool:
         """Tell whether a service is one of these, not to be served by the executor."""
@@ -118,10 +132,11 @@ class InOrder(Waitable):  # type: ignore[misc]  # see pyproject.toml
         """Return the calls that wait, in the order in which they came."""
         come = []
         for service in self._services:
-            with service.handle:
+            with suppress(InvalidHandle), service.handle:
                 take = partial(service.handle.service_take_request, service.srv_type.Request)
                 for request, header in iter(take, (None, None)):
-                    come.append((header.received_timestamp, service, request, header))
+                    stamp = header.received_timestamp or header.source_timestamp  # 0: unknown
+                    come.append((stamp, service, request, header))
         return sorted(come, key=itemgetter(0))
 
     async def execute(self, taken_data: list[tuple[int, Service, Any, Any]]) -> None:

@@ -4,13 +4,14 @@
 
 import resource
 import signal
+import threading
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from ros_cell import START, STOPS, Cell, Child, direct, part, topics, values_of
+from ros_cell import PATIENCE, START, STOPS, Cell, Child, direct, part, topics, values_of
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -234,3 +235,18 @@ def test_a_full_disk(tmp_path, recording):
         cell.done('save')
         assert child.end(signal.SIGINT) == 0
         assert child.output.count('poses are kept in memory only') == 1
+
+
+def test_a_closed_node_does_not_end_its_executor(tmp_path):
+    """In a process with other nodes, spun on a thread, its services were waited for without it."""
+    with Cell() as cell:
+        node, heard = cell.start(chain='ur10e', data_dir=str(tmp_path)), threading.Event()
+        others = threading.Thread(target=cell.executor.spin)
+        others.start()
+        cell.nodes.remove(node)
+        node.close()
+        cell.peer.create_timer(0.01, heard.set)
+        found = heard.wait(PATIENCE)
+        cell.executor.shutdown()
+        others.join()
+        assert found

@@ -5,6 +5,8 @@
 import errno
 import queue
 import threading
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 from rcl_interfaces.srv import SetParameters
@@ -17,6 +19,7 @@ from calib_ros.files import loading
 from calib_ros.files.history import History
 from calib_ros.identification.identification import identify
 from calib_ros.ros.arguments import NODE
+from calib_ros.ros.boundary import InOrder
 
 
 @pytest.fixture
@@ -236,3 +239,18 @@ def test_calls_that_wait_are_answered_in_order(cell, recording, calls):
     cell.spin_until(lambda: all(answer.done() for answer in answers))
     for said, answer in zip(calls.values(), answers, strict=True):
         assert said in getattr(answer.result(), 'message', '')
+
+
+@pytest.mark.parametrize('clock', ['received_timestamp', 'source_timestamp'])
+def test_calls_are_in_order_by_the_stamps_that_the_middleware_has(clock):
+    """Some leave the time of reception at zero."""
+    stamps = {'clear': [30, 10], 'identify': [20]}
+
+    def served(name):
+        blank = {'received_timestamp': 0, 'source_timestamp': 0}
+        come = [(name, SimpleNamespace(**{**blank, clock: each})) for each in stamps[name]]
+        handle = MagicMock(service_take_request=lambda kind: come.pop(0) if come else (None, None))
+        return SimpleNamespace(handle=handle, srv_type=Trigger)
+
+    calls = InOrder(MagicMock(services=[*map(served, stamps)])).take_data()
+    assert [request for _, _, request, _ in calls] == ['clear', 'identify', 'clear']
