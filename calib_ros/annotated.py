@@ -23,6 +23,7 @@ from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
 
 Positive: TypeAlias = Annotated[float, lambda x: 0.0 < x < math.inf, 'a positive number']
 NotNegative: TypeAlias = Annotated[float, lambda x: 0.0 <= x < math.inf, 'a number of at least 0']
+Limit: TypeAlias = Annotated[float, lambda x: x >= 0.0, 'a number of at least 0']  # inf: none
 Share: TypeAlias = Annotated[float, lambda x: 0.0 < x < 1.0, 'between 0 and 1, as 0.95']
 Fraction: TypeAlias = Annotated[float, lambda x: 0.0 <= x < 1.0, 'from 0 to 1']
 Count: TypeAlias = Annotated[int, lambda x: x >= 1, 'at least 1']

@@ -44,6 +44,13 @@ def test_a_value_fits_on_a_screen(value):
     assert len(re.findall('<tr>', value._repr_html_())) >= 5
 
 
+@pytest.mark.parametrize('name', ['largest_length', 'largest_angle', 'largest_error'])
+def test_limits_of_what_is_accepted_may_be_infinite(name):
+    """As a study of any arm wants them."""
+    found = calib_ros.identify(replace(PROBLEM, **{name: np.inf}))
+    assert found.refusals == RESULT.refusals
+
+
 @pytest.mark.parametrize(
     ('call', 'said'),
     [

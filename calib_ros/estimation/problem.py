@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calib_ros.annotated import Fraction, NotNegative, Positive, Several, check_fields
+from calib_ros.annotated import Fraction, Limit, Positive, Several, check_fields
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import SCATTER
@@ -58,10 +58,10 @@ class Problem(Shown):
     """Parameters to hold at their nominal values; `*` and `?` match as in file names."""
     folds: Several = Settings.folds
     """Number of cross-validation folds."""
-    largest_length: NotNegative = Settings.largest_length
-    largest_angle: NotNegative = Settings.largest_angle
+    largest_length: Limit = Settings.largest_length
+    largest_angle: Limit = Settings.largest_angle
     """Largest accepted offsets [m, rad], beyond any fault of the right robot."""
-    largest_error: NotNegative = Settings.largest_error
+    largest_error: Limit = Settings.largest_error
     """Largest accepted RMS position error [m] on held-out poses."""
     loss: str = Settings.loss
     """Treatment of gross errors (`robust.py`): redescending, huber or none."""
