@@ -25,7 +25,7 @@ from calib_ros.files import boards
 from calib_ros.files.lenses import read_lens
 from calib_ros.files.loading import Loaded, of_bag, of_table
 from calib_ros.files.rows import identified as row_of
-from calib_ros.identification.age import years_since
+from calib_ros.identification.age import refuse_older, years_since
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.recalibration import recalibrate
@@ -106,6 +106,7 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         for warning in loaded.warnings:
             screen.warn(warning)
         new = ('base',) * options.new_base + ('tool',) * options.new_tool
+        refuse_older(previous.record, loaded.problem.all_sets)
         years = years_since(previous.record, loaded.problem.all_sets)
         growth = 1e-3 * options.growth
         problem = loaded.between(previous.frames_of(loaded.owners))

@@ -43,31 +43,34 @@ def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None)
 
 
 def recorded_time(sets: Sequence[Observations]) -> str | None:
-    """Return the time of the last pose for a record; now if that is later, None if no time."""
+    """Return the time of the last pose for a record, at most now; None if no time, or to come."""
     time, now = measured_at(sets, NEVER), datetime.now(timezone.utc)
-    return None if time == NEVER else min(time, now).isoformat(timespec='seconds')
+    unknown = time == NEVER or time - now > A_DAY  # of a clock that is wrong
+    return None if unknown else min(time, now).isoformat(timespec='seconds')
 
 
 def years_since(record: Mapping[str, Any], sets: Sequence[Observations] = ()) -> float:
-    """Return the age [years] of a calibration when new poses were measured.
+    """Return the time [years] between the poses of a calibration and new ones.
 
-    If one of the two has no times: until now, since it was made; 1 if not known. Raises InputError
-    if the new poses are older than its own.
+    If one of the two has no times: until now, since it was made; 1 if not known.
     """
     now = datetime.now(timezone.utc)
     then, new = _time_in(record, 'measured'), min(measured_at(sets, NEVER), now)
-    if then is None or new == NEVER:
-        made = _time_in(record, 'created')
-        if made is None or made - now > A_DAY:
-            return 1.0
-        return max(0.0, (now - made) / YEAR)
-    if then - new > A_DAY:
+    if then is not None and new != NEVER:
+        return abs(new - then) / YEAR
+    made = _time_in(record, 'created')
+    return 1.0 if made is None or made - now > A_DAY else max(0.0, (now - made) / YEAR)
+
+
+def refuse_older(record: Mapping[str, Any], sets: Sequence[Observations]) -> None:
+    """Raise InputError for an update of a calibration by poses older than its own."""
+    then, new = _time_in(record, 'measured'), measured_at(sets, NEVER)
+    if then is not None and new != NEVER and then - new > A_DAY:
         raise InputError(
             f'the new poses were measured on {new:%Y-%m-%d}, before those of the earlier '
             f'calibration ({then:%Y-%m-%d}): update it in the order of time; if they are newer, '
             'the clock of the recorder is wrong'
         )
-    return max(0.0, (new - then) / YEAR)
 
 
 def years_between(first: Mapping[str, Any], second: Mapping[str, Any]) -> float:

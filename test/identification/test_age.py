@@ -11,7 +11,13 @@ from fits import UR10E, arm, problem
 
 from calib_ros import Calibration, identify, recalibrate
 from calib_ros.errors import InputError
-from calib_ros.identification.age import YEAR, measured_at, years_between, years_since
+from calib_ros.identification.age import (
+    YEAR,
+    measured_at,
+    refuse_older,
+    years_between,
+    years_since,
+)
 from calib_ros.identification.calibration import parse_calibration
 
 BEGIN = datetime(2025, 3, 1, 22, 0, tzinfo=timezone.utc)
@@ -68,15 +74,20 @@ def test_the_time_between_two_calibrations_is_that_between_their_poses():
     assert years_between(earlier, {}) == 0.0
 
 
-def test_poses_older_than_those_of_the_calibration_are_refused(earlier):
-    """They would take the arm back to what it was before the last change."""
+def test_updates_by_poses_older_than_those_of_the_calibration_are_refused(earlier):
+    """They would take the arm back to what it was before the last change; a check may use them."""
+    two_days = at(BEGIN - timedelta(days=2)).all_sets
     with pytest.raises(InputError, match=r'on 2025-02-27, before .* \(2025-03-01\)'):
-        years_since(earlier.record, at(BEGIN - timedelta(days=2)).all_sets)
-    assert years_since(earlier.record, at(BEGIN - timedelta(hours=14)).all_sets) == 0.0
+        refuse_older(earlier.record, two_days)
+    assert years_since(earlier.record, two_days) == pytest.approx(2.0 / 365.25)
+    refuse_older(earlier.record, at(BEGIN - timedelta(hours=14)).all_sets)
 
 
-def test_stamps_in_the_future_count_as_now():
+def test_stamps_in_the_future_are_no_times():
     """Else a recorder's wrong clock would refuse all poses once it is right."""
-    later = at(datetime.now(timezone.utc) + timedelta(days=4000), 40)
+    now = datetime.now(timezone.utc)
+    later = at(now + timedelta(days=4000), 40)
     record = Calibration.of(identify(later), fitted=later.all_sets).record
-    assert years_since(record, later.all_sets) < 1e-4
+    for new in (later, at(now - timedelta(days=5))):
+        refuse_older(record, new.all_sets)
+        assert years_since(record, new.all_sets) < 1e-4

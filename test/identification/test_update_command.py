@@ -3,7 +3,9 @@
 """`identify --previous`, night after night."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from fits import UR10E, arm, problem
 from measured import rows_of, write_csv
@@ -86,3 +88,20 @@ def test_the_calibration_of_another_serial_number_is_not_brought_up_to_date(
         status, _, told = run(*given, 'out', '--serial', serial)
         assert status == 1
         assert f'serial "0042"; this one is "{serial}"' in told
+
+
+@pytest.mark.parametrize(('day', 'status'), [('2025-03-01', 0), ('2025-03-09', 1)])
+def test_a_calibration_by_newer_poses_is_not_brought_up_to_date(
+    earlier, run, tmp_path, day, status
+):
+    true, previous = earlier
+    measured = {**previous.record, 'measured': f'{day}T22:00:00+00:00'}
+    (tmp_path / 'earlier.yaml').write_text(replace(previous, record=measured).dump())
+    stamps = 1_741_000_000_000_000_000 + 10**9 * np.arange(8)  # 2025-03-03
+    rows = rows_of(problem(true, 8, 1).observations, 0)
+    stamped = [{**row, 'stamp_ns': stamp} for row, stamp in zip(rows, stamps, strict=True)]
+    write_csv(tmp_path / 'few.csv', stamped)
+    given = ('identify', 'few.csv', '--chain', 'ur10e', '--previous', 'earlier.yaml')
+    found, _, told = run(*given, '--sigma-position', '5e-5', '--sigma-orientation', '2e-4')
+    assert found == status
+    assert ('measured on 2025-03-03, before those' in told) == bool(status)
