@@ -22,12 +22,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import MOST_ENTRIES, ColumnsError, InputError
 from calib_ros.files.headers import refuse_separator
-from calib_ros.files.vocabulary import (
-    DECIMAL_COMMA,
-    IN_ORDER,
-    MISSING,
-    THOUSANDS,
-)
+from calib_ros.files.vocabulary import DECIMAL_COMMA, IN_ORDER, MISSING, THOUSANDS
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.shown import some

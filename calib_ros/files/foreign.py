@@ -33,12 +33,7 @@ from calib_ros.files.headers import (
     places,
 )
 from calib_ros.files.layouts import Expression, Layout
-from calib_ros.files.names import (
-    as_typed,
-    in_doubt,
-    quaternions_in,
-    turns_in,
-)
+from calib_ros.files.names import in_doubt, option, quaternions_in, turns_in
 from calib_ros.files.sheets import read_sheet
 from calib_ros.files.skipped import measured, without_statistics
 from calib_ros.files.units import Units
@@ -112,9 +107,8 @@ class Foreign:
         if 'q1' not in joints.cells:
             count = 0 if self.chain is None else len(self.chain.joints)
             like = like_joints(log.names, count) or {'q*': 'NAME*'}
-            given = ','.join(f'{ours}={as_typed(name)}' for ours, name in like.items())
             raise InputError(
-                f'{log.path} has no column q1; {log.has}: give --columns "{given}" or '
+                f'{log.path} has no column q1; {log.has}: give {option(like, like.values())} or '
                 '--joints-preset'
             )
         matched, partners = _partners(table, log)
@@ -157,11 +151,8 @@ class _Table:
         own: dict[str, str] = {}  # names that need no layout, and ours
         if joints:
             own = {name: name for name in joint_columns(most, 'qsva')}
-            own |= (
-                {}
-                if chain is None
-                else dict(zip(chain.joint_names, joint_columns(most), strict=True))
-            )
+            called = () if chain is None else chain.joint_names
+            own |= zip(called, joint_columns(len(called)), strict=True)
         if not alone:
             own |= {name: name for name in (*NUMBERS, *WORDS)}
         self._sheet = read_sheet(path, layout, list(needed), list(own))
@@ -231,11 +222,10 @@ class _Table:
 
     def _refuse_nominal(self, kept: Mapping[str, Expression]) -> None:
         """Refuse columns taken by our names if they may be nominal ones."""
-        count = len({*kept} & {*joint_columns(MOST_NAMES)})
-        doubt = commanded(self.names, count) if 'q1' in kept else ''
-        if {*POSITION} <= {*kept}:
-            called = (self._sheet.called(kept[ours].names[0]) for ours in POSITION)
-            doubt = in_doubt(self.names, [name_and_unit(name)[0] for name in called]) or doubt
+        called = [self._sheet.called(kept[n].names[0]) for n in POSITION if n in kept]
+        doubt = in_doubt(self.names, [name_and_unit(name)[0] for name in called])
+        if not doubt and 'q1' in kept:
+            doubt = commanded(self.names, len({*kept} & {*joint_columns(MOST_NAMES)}))
         if doubt:
             raise InputError(f'{self.path}: {doubt}')
 
@@ -266,14 +256,9 @@ class _Table:
         return math.isinf(cell_number(sheet.texts(number)[0], sheet.decimal))
 
     @property
-    def header(self) -> tuple[str, ...]:
-        """Return the names of the columns that have one."""
-        return tuple(filter(None, self._sheet.header))
-
-    @property
     def has(self) -> str:
         """Return in words which columns there are."""
-        return f'it has {listed(self.header)}'
+        return f'it has {listed(self._sheet.header)}'
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -290,7 +275,7 @@ class _Table:
 
         Numbers name them under one name, their kind. Capitals and leading zeros may differ.
         """
-        theirs = {name.lower() for name in other.header}
+        theirs = {name.lower() for name in other._sheet.header}
         for k, name in enumerate(self._sheet.header, start=1):
             cells = self._sheet.columns.texts(f'#{k}')
             number = math.isfinite(cell_number(next(iter(cells), ''), self._sheet.columns.decimal))

@@ -16,8 +16,8 @@ from calib_ros.files.names import (
     NO_JOINT,
     NOMINAL_WORDS,
     OTHER,
-    as_typed,
     is_distance,
+    option,
     positions_in,
     quaternions_in,
     words_of,
@@ -107,41 +107,40 @@ def named_by_option(
     if several := [name for name in missing if header.count(name) > 1]:
         return f'Several columns are called {", ".join(several)}: rename all but one'
     if _only_numbers(header):
-        numbers = ','.join(f'{name}=#{k}' for k, name in enumerate(missing, 1))
-        return f'Its first line holds numbers, not names: --columns "{numbers}", in its order'
-    coordinates = [name for name in POSITION if name in missing]
-    found: dict[str, str] = dict.fromkeys(missing, 'NAME')
-    found |= positions_in(header, coordinates) if coordinates else {}
-    of_joints = {*joint_columns(joints)}
-    lacking = of_joints & found.keys()
-    whole = bool(joints) and lacking == of_joints
+        given = option(missing, [f'#{k}' for k in range(1, len(missing) + 1)])
+        return f'Its first line holds numbers, not names: {given}, in its order'
+    names = joint_columns(joints)
+    lacking = [name for name in names if name in missing]
+    whole = bool(joints) and len(lacking) == joints
     fewer = bool(lacking) and 'q1' in header and 'q0' not in header
     like = like_joints(header, joints) if lacking and not fewer else {}
     more = '; joint values in another file: --joints FILE' if whole and not like else ''
-    theirs = [named_in(header, name) for name in called]
-    rest = [each for each in header if each and each.lower() not in (*NUMBERS, *WORDS)]
-    if whole and not like and called and len(rest) == joints and {*POSITION} <= {*header}:
-        like = dict(zip(joint_columns(joints), rest, strict=True))
-    elif whole and not like and called and all(theirs):
-        like = dict(zip(joint_columns(joints), theirs, strict=True))
-        free = {each for each in header if each not in theirs}
-        found |= {n: 'NAME' for n in POSITION if not {n, found.get(n, '')} & free}
-    if whole or like:
-        more_of = {name: each for name, each in found.items() if name not in of_joints}
-        found = (like or {'q*': 'NAME*'}) | more_of
-    if {*POSITION} <= {*missing} and found[POSITION[0]] != 'NAME':
-        found |= quaternions_in(header, sure=False)
-    elif {*POSITION} <= {*missing} and len(wires := [*filter(is_distance, header)]) == 1:
-        found = {n: each for n, each in found.items() if n not in POSITION}
-        found['distance'] = wires[0]
-    if words_of(found.get('x', ''))[1:] in (['m'], ['in']):  # X_in is not read as a unit
-        more = f' --length {words_of(found["x"])[1]}{more}'
-    given = ','.join(f'{name}={as_typed(each)}' for name, each in found.items())
+    found = dict.fromkeys([name for name in missing if name not in lacking], 'NAME')
+    found |= positions_in(header, [name for name in POSITION if name in missing])
+    if more and called:
+        rest = [each for each in header if each and each.lower() not in (*NUMBERS, *WORDS)]
+        theirs = [named_in(header, name) for name in called]
+        if len(rest) == joints and {*POSITION} <= {*header}:
+            like = dict(zip(names, rest, strict=True))
+        elif all(theirs):
+            like, free = dict(zip(names, theirs, strict=True)), {*header} - {*theirs}
+            found |= {n: 'NAME' for n in POSITION if not {n, found.get(n, '')} & free}
+    if {*POSITION} <= {*missing}:
+        wires = [*filter(is_distance, header)]
+        if found['x'] != 'NAME':
+            found |= quaternions_in(header, sure=False)
+        elif len(wires) == 1:
+            found = {n: each for n, each in found.items() if n not in POSITION}
+            found['distance'] = wires[0]
+    if (unit := words_of(found.get('x', ''))[1:]) in (['m'], ['in']):  # X_in is not read as a unit
+        more = f' --length {unit[0]}{more}'
+    found = (like or ({'q*': 'NAME*'} if whole else dict.fromkeys(lacking, 'NAME'))) | found
+    given = option(found, found.values())
     if len(given) > LONGEST // 3:  # a message would lose its middle
-        short = {each: f'#{header.index(each) + 1}' for each in found.values() if each in header}
-        given = ','.join(f'{n}={short.get(each, as_typed(each))}' for n, each in found.items())
-    options = f'Columns of other names: --columns "{given}"{more}'
-    return f'Is it another arm (--chain)? {options}' if fewer else options
+        short = {name: f'#{k}' for k, name in reversed([*enumerate(header, 1)])}
+        given = option(found, [short.get(each, each) for each in found.values()])
+    another = 'Is it another arm (--chain)? ' * fewer
+    return f'{another}Columns of other names: {given}{more}'
 
 
 def named_in(header: Sequence[str], joint: str) -> str:
@@ -168,10 +167,9 @@ def commanded(header: Sequence[str], joints: int) -> str:
     like = like_joints([name for name in header if _rank(name) < 0], joints) if joints else {}
     if not like:
         return ''
-    given = ','.join(f'{ours}={as_typed(name)}' for ours, name in like.items())
     return (
         f'q1 may be commanded beside {next(iter(like.values())).replace("*", "1")}: give '
-        f'--columns "{given}", or --columns "q*=q*" if it was measured'
+        f'{option(like, like.values())}, or --columns "q*=q*" if it was measured'
     )
 
 

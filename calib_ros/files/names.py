@@ -5,12 +5,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from calib_ros.files.vocabulary import POSITION, QUATERNION
 
 WORD = re.compile(r'[^\W\d_A-Z]+|[A-Z][^\W\d_A-Z]+|[A-Z]+(?![a-z])|[0-9]+')
 """Words of a name: `X_meas`, `pose.position.x`, `dX`, `Nominal X`."""
+PLAIN = re.compile(r'#[\d*]+|[^\W\d][\w*]*(\.[\w*]+)*')
+"""Names that --columns takes without braces."""
 
 
 def _set(words: str) -> frozenset[str]:
@@ -45,29 +47,24 @@ def words_of(name: str) -> list[str]:
     return [part for w in words for part in (w if re.fullmatch('[a-z][xyzw]', w) else (w,))]
 
 
-def groups(header: Sequence[str], axes: str) -> Iterator[tuple[frozenset[str], dict[str, str]]]:
-    """Yield the other words of columns that have all of some axes, and their names by axis."""
+def groups(
+    header: Sequence[str], axes: Sequence[str], without: frozenset[str]
+) -> dict[frozenset[str], list[str]]:
+    """Return the names of columns that have all of some axes, in their order, by other words."""
     found: dict[frozenset[str], dict[str, str]] = {}
     for name in header:
         words = words_of(name)
         axis = [word for word in words if word in 'xyzw']
-        if len(axis) == 1 and header.count(name) == 1:
+        if len(axis) == 1 and header.count(name) == 1 and not without & {*words} - {*axis}:
             found.setdefault(frozenset(words) - {*axis}, {}).setdefault(axis[0], name)
-    for others, names in found.items():
-        if {*axes} <= {*names}:
-            yield others, {axis: names[axis] for axis in axes}
+    return {w: [each[a] for a in axes] for w, each in found.items() if {*axes} <= {*each}}
 
 
-def _one(found: Sequence[tuple[frozenset[str], dict[str, str]]]) -> list[str]:
+def _one(found: Mapping[frozenset[str], Sequence[str]]) -> Sequence[str]:
     """Return the names in the only group, in the measured or the plain one."""
-    for some in (
-        [g for g in found if g[0] & MEASURED_WORDS],
-        [g for g in found if not g[0]],
-        found,
-    ):
-        if len(some) == 1:
-            return [*some[0][1].values()]
-    return []
+    measured = [names for words, names in found.items() if words & MEASURED_WORDS]
+    plain = [names for words, names in found.items() if not words]
+    return next((each[0] for each in (measured, plain, [*found.values()]) if len(each) == 1), ())
 
 
 def is_distance(name: str) -> bool:
@@ -78,49 +75,43 @@ def is_distance(name: str) -> bool:
 
 def positions_in(header: Sequence[str], missing: Sequence[str] = POSITION) -> dict[str, str]:
     """Return the names of measured coordinates, never of nominal ones, if only some may be."""
-    known = [each for each in groups(header, ''.join(missing)) if not each[0] & NO_PLACE]
-    names = _one(known)
-    doubt = in_doubt(header, names) if len(names) == len(POSITION) else ''
-    return {} if doubt else dict(zip(missing, names, strict=False))
+    names = _one(groups(header, missing, without=NO_PLACE))
+    return {} if in_doubt(header, names) else dict(zip(missing, names, strict=False))
 
 
 def quaternions_in(header: Sequence[str], sure: bool = True) -> dict[str, str]:
     """Return the names of a quaternion called so; if `sure`, of nothing else."""
-    known = [each for each in groups(header, 'xyzw') if each[0] & TURNED]
-    known = [each for each in known if not each[0] & (NOMINAL_WORDS | DEVIATION | OTHER)]
-    if sure and (len(known) > 1 or any(words - TURNED - MEASURED_WORDS for words, _ in known)):
+    found = groups(header, 'xyzw', without=NO_PLACE - TURNED)
+    known = {words: names for words, names in found.items() if words & TURNED}
+    if sure and (len(known) > 1 or any(words - TURNED - MEASURED_WORDS for words in known)):
         return {}
     return dict(zip(QUATERNION, _one(known), strict=False))
 
 
 def in_doubt(header: Sequence[str], plain: Sequence[str]) -> str:
-    """Return why coordinates in columns with `plain` names may be nominal, with the options."""
-    known = {words: each for words, each in groups(header, 'xyz') if not words & (TURNED | OTHER)}
-    measured = [each for words, each in known.items() if words & MEASURED_WORDS - DEVIATION]
-    apart = [each for words, each in known.items() if words & DEVIATION]
-    first, second = [], [*map(as_typed, plain)]
-    if measured and [*measured[0].values()] != [*plain]:
-        beside = [*measured[0].values()]
-        first = [*map(as_typed, beside)]
-    elif apart and not measured and not any(words & NOMINAL_WORDS - DEVIATION for words in known):
-        beside = [*apart[0].values()]
-        first = [f'{a}+{as_typed(b)}' for a, b in zip(second, beside, strict=True)]
-    if not first:
+    """Return why x, y, z in columns with `plain` names may be nominal, with the options."""
+    known = groups(header, 'xyz', without=TURNED | OTHER)
+    measured, nominal, apart = (
+        [names for words, names in known.items() if words & some]
+        for some in (MEASURED_WORDS, NOMINAL_WORDS, DEVIATION)
+    )
+    beside = next(iter(measured or ([] if nominal else apart)), plain)
+    if len(plain) < len(POSITION) or beside == [*plain]:
         return ''
-    options = (
-        ','.join(f'{ours}={name}' for ours, name in zip(POSITION, names, strict=True))
-        for names in (first, second)
-    )
+    better = option(POSITION, beside) if measured else option(POSITION, plain, beside)
     return (
-        f'{", ".join(plain)} may be nominal beside {", ".join(beside)}: give --columns '
-        f'"{next(options)}", or --columns "{next(options)}" if they were measured'
+        f'{", ".join(plain)} may be nominal beside {", ".join(beside)}: give {better}, or '
+        f'{option(POSITION, plain)} if they were measured'
     )
 
 
-def as_typed(name: str) -> str:
-    """Return the name of a column as --columns takes it."""
-    plain = re.fullmatch(r'#[\d*]+|[^\W\d][\w*]*(\.[\w*]+)*', name)
-    return name if plain else f'{{{name}}}'
+def option(ours: Iterable[str], *theirs: Iterable[str]) -> str:
+    """Return --columns for our columns by the names of theirs, or of those to add."""
+    given = (
+        f'{name}={"+".join(n if PLAIN.fullmatch(n) else f"{{{n}}}" for n in names)}'
+        for name, *names in zip(ours, *theirs, strict=True)
+    )
+    return f'--columns "{",".join(given)}"'
 
 
 def turns_in(header: Sequence[str]) -> str:
@@ -130,7 +121,5 @@ def turns_in(header: Sequence[str]) -> str:
         found = [next((n for w, n in words.items() if w == (a,)), '') for a in angles]
         if all(found):
             ours = [f'r{k}' for k in (1, 2, 3)] if euler == 'ZYX' else ['rx', 'ry', 'rz']
-            pairs = zip(ours, map(as_typed, found), strict=True)
-            given = ','.join(f'{name}={theirs}' for name, theirs in pairs)
-            return f'to use {", ".join(found)}, give --columns "{given}" --euler {euler}'
+            return f'to use {", ".join(found)}, give {option(ours, found)} --euler {euler}'
     return ''

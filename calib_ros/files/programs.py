@@ -20,12 +20,7 @@ import numpy as np
 
 from calib_ros.apply.program import Program, joint_values
 from calib_ros.errors import InputError
-from calib_ros.files.columns import (
-    Columns,
-    check_quaternions,
-    columns_of,
-    with_rows,
-)
+from calib_ros.files.columns import Columns, check_quaternions, columns_of, with_rows
 from calib_ros.files.headers import name_and_unit, places
 from calib_ros.files.sheets import decimal_sign, text_and_separator
 from calib_ros.files.vocabulary import ANGLES, LENGTHS, POSE_COLUMNS, joint_columns

@@ -36,16 +36,9 @@ from calib_ros.files.headers import (
 )
 from calib_ros.files.journal import columns, of_journal
 from calib_ros.files.measurements import Measurements, distinct_rows, measurements
-from calib_ros.files.names import in_doubt, quaternions_in, turns_in
+from calib_ros.files.names import in_doubt, option, quaternions_in, turns_in
 from calib_ros.files.skipped import measured, without_statistics
-from calib_ros.files.vocabulary import (
-    MATRIX,
-    POSITION,
-    QUATERNION,
-    TURNS,
-    WORDS,
-    joint_columns,
-)
+from calib_ros.files.vocabulary import MATRIX, POSITION, QUATERNION, TURNS, WORDS, joint_columns
 from calib_ros.kinematics.se3 import Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.dataset import Dataset, dataset_of
@@ -95,8 +88,9 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
         meant |= {name: ours for ours, name in quaternions_in(found.header).items()}
     cells = {meant.get(name, name): given for name, given in found.cells.items()}
     found = replace(found, cells=cells)
-    doubt = in_doubt(found.header, POSITION) if {*POSITION} <= {*cells} else ''
-    doubt = doubt or (commanded(found.header, joints) if 'q1' in cells else '')
+    doubt = in_doubt(found.header, [name for name in POSITION if name in cells])
+    if not doubt and 'q1' in cells:
+        doubt = commanded(found.header, joints)
     if doubt:
         raise ColumnsError(f'{path}: {doubt}')
     found, left = without_statistics(found)
@@ -179,12 +173,11 @@ def check_table(made: Columns) -> None:
     """Refuse columns that no table may have: any sessions, with as many joints as there are."""
     joints = sum(re.fullmatch('q[0-9]+', name) is not None for name in made.cells)
     if not joints:
-        like = (like_joints(made.theirs, count) for count in range(9, 2, -1))
-        given = ','.join(
-            '='.join(each) for each in next(filter(None, like), {'q1': '...'}).items()
-        )
+        likes = (like_joints(made.theirs, count) for count in range(9, 2, -1))
+        like = next(filter(None, likes), {'q*': 'NAME*'})
+        given = option(like, like.values())
         raise InputError(
-            f'{made.path} has no joint values: name their columns (--columns "{given}"), give the '
+            f'{made.path} has no joint values: name their columns ({given}), give the '
             'chain with those joint names (--chain), or their separate table (--joints)'
         )
     sessions = made.texts('session') if 'session' in made.cells else ()

@@ -326,7 +326,13 @@ def test_faults_are_named(read, text, layout, said):
 
 
 @pytest.mark.parametrize(
-    ('names', 'proposed'), [('', 'q1=...'), (',J1,J2,J3 [deg]', 'q*=J*'), (',A0,A1,A2', 'q1=A0,')]
+    ('names', 'proposed'),
+    [
+        ('', 'q*=NAME*'),
+        (',J1,J2,J3 [deg]', 'q*=J*'),
+        (',A0,A1,A2', 'q1=A0,'),
+        (',Axis 1,Axis 2,Axis 3', 'q*={Axis *}'),
+    ],
 )
 def test_a_table_without_joint_values_is_refused(run, tmp_path, names, proposed):
     (tmp_path / 'cell.csv').write_text(f'x,y,z{names}\n1,2,3{",4" * names.count(",")}\n')
