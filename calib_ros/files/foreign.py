@@ -21,19 +21,9 @@ import numpy as np
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.columns import Columns, cell_number
 from calib_ros.files.conventions import finished
-from calib_ros.files.headers import (
-    commanded,
-    like_joints,
-    listed,
-    name_and_unit,
-    named_by_option,
-    named_in,
-    not_read,
-    only,
-    places,
-)
+from calib_ros.files.headers import listed, name_and_unit, named_by_option, not_read, only, places
 from calib_ros.files.layouts import Expression, Layout
-from calib_ros.files.names import in_doubt, option, quaternions_in, turns_in
+from calib_ros.files.names import in_doubt, like_joints, named_in, option, quaternions_in, turns_in
 from calib_ros.files.sheets import read_sheet
 from calib_ros.files.skipped import measured, without_statistics
 from calib_ros.files.units import Units
@@ -223,10 +213,8 @@ class _Table:
     def _refuse_nominal(self, kept: Mapping[str, Expression]) -> None:
         """Refuse columns taken by our names if they may be nominal ones."""
         called = [self._sheet.called(kept[n].names[0]) for n in POSITION if n in kept]
-        doubt = in_doubt(self.names, [name_and_unit(name)[0] for name in called])
-        if not doubt and 'q1' in kept:
-            doubt = commanded(self.names, len({*kept} & {*joint_columns(MOST_NAMES)}))
-        if doubt:
+        joints = len({*kept} & {*joint_columns(MOST_NAMES)}) * ('q1' in kept)
+        if doubt := in_doubt(self.names, [name_and_unit(name)[0] for name in called], joints):
             raise InputError(f'{self.path}: {doubt}')
 
     def _complete(self, chain: Chain) -> None:

@@ -4,19 +4,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
-from itertools import product
 from pathlib import Path
 
 from calib_ros.errors import LONGEST, ColumnsError, InputError, shortened
 from calib_ros.files.names import (
-    JOINT_WORDS,
     MEASURED_WORDS,
-    NO_JOINT,
     NOMINAL_WORDS,
-    OTHER,
     is_distance,
+    like_joints,
+    named_in,
+    only_numbers,
     option,
     positions_in,
     quaternions_in,
@@ -106,7 +104,7 @@ def named_by_option(
     """
     if several := [name for name in missing if header.count(name) > 1]:
         return f'Several columns are called {", ".join(several)}: rename all but one'
-    if _only_numbers(header):
+    if only_numbers(header):
         given = option(missing, [f'#{k}' for k in range(1, len(missing) + 1)])
         return f'Its first line holds numbers, not names: {given}, in its order'
     names = joint_columns(joints)
@@ -141,49 +139,3 @@ def named_by_option(
         given = option(found, [short.get(each, each) for each in found.values()])
     another = 'Is it another arm (--chain)? ' * fewer
     return f'{another}Columns of other names: {given}{more}'
-
-
-def named_in(header: Sequence[str], joint: str) -> str:
-    """Return the column of the name of a joint, or the only one for values with it."""
-    low = joint.lower()
-    same = [each for each in header if each.lower() == low]
-    longer = [each for each in header if low in each.lower() and not {*words_of(each)} & OTHER]
-    return (same or longer * (len(longer) == 1) or [''])[0]
-
-
-def _only_numbers(header: Sequence[str]) -> bool:
-    return bool(header) and all(re.fullmatch(r'-?[\d.]+(e[+-]?\d+)?', name) for name in header)
-
-
-def _rank(name: str) -> int:
-    """Return -1 for a measured joint by its name, 1 for a nominal one, 2 and more for others."""
-    words = {*words_of(name)}
-    other = not words & JOINT_WORDS or bool(words & NO_JOINT)
-    return bool(words & NOMINAL_WORDS) - bool(words & MEASURED_WORDS) + 3 * other
-
-
-def commanded(header: Sequence[str], joints: int) -> str:
-    """Return why q1, q2 ... may be commanded values, with the options; empty if they are not."""
-    like = like_joints([name for name in header if _rank(name) < 0], joints) if joints else {}
-    if not like:
-        return ''
-    return (
-        f'q1 may be commanded beside {next(iter(like.values())).replace("*", "1")}: give '
-        f'{option(like, like.values())}, or --columns "q*=q*" if it was measured'
-    )
-
-
-def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:
-    """Return the names in a header that count the joints, with a star for the number from 1."""
-    if _only_numbers(header):
-        return {'q*': '#*'}
-    for name, first in product(
-        sorted(header, key=lambda each: (_rank(each), len(words_of(each)))), (1, 0)
-    ):
-        for one in re.finditer(str(first), name):
-            before, after = name[: one.start()], name[one.end() :]
-            like = [f'{before}{k}{after}' for k in range(first, joints + first)]
-            if {*like} <= {*header}:
-                count = dict(zip(joint_columns(joints), like, strict=True))
-                return {'q*': f'{before}*{after}'} if first else count
-    return {}

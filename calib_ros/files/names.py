@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 
-from calib_ros.files.vocabulary import POSITION, QUATERNION
+from calib_ros.files.vocabulary import IN_TURN, POSITION, QUATERNION, TURNS, joint_columns
 
 WORD = re.compile(r'[^\W\d_A-Z]+|[A-Z][^\W\d_A-Z]+|[A-Z]+(?![a-z])|[0-9]+')
 """Words of a name: `X_meas`, `pose.position.x`, `dX`, `Nominal X`."""
@@ -37,7 +38,11 @@ OTHER = NO_JOINT | _set(
 )
 """Other quantities that have coordinates, too."""
 NO_PLACE = NOMINAL_WORDS | DEVIATION | TURNED | OTHER
-EULER = {('roll', 'pitch', 'yaw'): 'xyz', ('a', 'b', 'c'): 'ZYX', ('w', 'p', 'r'): 'xyz'}
+EULER = {
+    ('roll', 'pitch', 'yaw'): (TURNS, 'xyz'),
+    ('a', 'b', 'c'): (IN_TURN, 'ZYX'),
+    ('w', 'p', 'r'): (TURNS, 'xyz'),
+}
 """Names of three angles, with their meaning: about fixed axes, KUKA, Fanuc."""
 
 
@@ -73,7 +78,7 @@ def is_distance(name: str) -> bool:
     return bool(words & DISTANCE_WORDS) and not words & (NOMINAL_WORDS | DEVIATION | OTHER)
 
 
-def positions_in(header: Sequence[str], missing: Sequence[str] = POSITION) -> dict[str, str]:
+def positions_in(header: Sequence[str], missing: Sequence[str]) -> dict[str, str]:
     """Return the names of measured coordinates, never of nominal ones, if only some may be."""
     names = _one(groups(header, missing, without=NO_PLACE))
     return {} if in_doubt(header, names) else dict(zip(missing, names, strict=False))
@@ -88,21 +93,29 @@ def quaternions_in(header: Sequence[str], sure: bool = True) -> dict[str, str]:
     return dict(zip(QUATERNION, _one(known), strict=False))
 
 
-def in_doubt(header: Sequence[str], plain: Sequence[str]) -> str:
-    """Return why x, y, z in columns with `plain` names may be nominal, with the options."""
+def in_doubt(header: Sequence[str], plain: Sequence[str], joints: int = 0) -> str:
+    """Return why values in columns with plain names may be nominal, with the options.
+
+    These are coordinates in columns with `plain` names, and the values of joints in q1, q2 ...
+    """
     known = groups(header, 'xyz', without=TURNED | OTHER)
     measured, nominal, apart = (
         [names for words, names in known.items() if words & some]
         for some in (MEASURED_WORDS, NOMINAL_WORDS, DEVIATION)
     )
     beside = next(iter(measured or ([] if nominal else apart)), plain)
-    if len(plain) < len(POSITION) or beside == [*plain]:
-        return ''
-    better = option(POSITION, beside) if measured else option(POSITION, plain, beside)
-    return (
-        f'{", ".join(plain)} may be nominal beside {", ".join(beside)}: give {better}, or '
-        f'{option(POSITION, plain)} if they were measured'
-    )
+    if len(plain) == len(POSITION) and beside != [*plain]:
+        better = option(POSITION, beside) if measured else option(POSITION, plain, beside)
+        return (
+            f'{", ".join(plain)} may be nominal beside {", ".join(beside)}: give {better}, or '
+            f'{option(POSITION, plain)} if they were measured'
+        )
+    if joints and (like := like_joints([name for name in header if _rank(name) < 0], joints)):
+        return (
+            f'q1 may be commanded beside {next(iter(like.values())).replace("*", "1")}: give '
+            f'{option(like, like.values())}, or --columns "q*=q*" if it was measured'
+        )
+    return ''
 
 
 def option(ours: Iterable[str], *theirs: Iterable[str]) -> str:
@@ -117,9 +130,44 @@ def option(ours: Iterable[str], *theirs: Iterable[str]) -> str:
 def turns_in(header: Sequence[str]) -> str:
     """Return how to use the angles of a header, by their names; empty without any."""
     words = {tuple(words_of(name)): name for name in header}
-    for angles, euler in EULER.items():
-        found = [next((n for w, n in words.items() if w == (a,)), '') for a in angles]
+    for angles, (ours, euler) in EULER.items():
+        found = [words.get((angle,), '') for angle in angles]
         if all(found):
-            ours = [f'r{k}' for k in (1, 2, 3)] if euler == 'ZYX' else ['rx', 'ry', 'rz']
             return f'to use {", ".join(found)}, give {option(ours, found)} --euler {euler}'
     return ''
+
+
+def named_in(header: Sequence[str], joint: str) -> str:
+    """Return the column of the name of a joint, or the only one for values with it."""
+    low = joint.lower()
+    same = [each for each in header if each.lower() == low]
+    longer = [each for each in header if low in each.lower() and not {*words_of(each)} & OTHER]
+    return (same or longer * (len(longer) == 1) or [''])[0]
+
+
+def only_numbers(header: Sequence[str]) -> bool:
+    """Tell whether a header consists of numbers."""
+    return bool(header) and all(re.fullmatch(r'-?[\d.]+(e[+-]?\d+)?', name) for name in header)
+
+
+def _rank(name: str) -> int:
+    """Return -1 for a measured joint by its name, 1 for a nominal one, 2 and more for others."""
+    words = {*words_of(name)}
+    other = not words & JOINT_WORDS or bool(words & NO_JOINT)
+    return bool(words & NOMINAL_WORDS) - bool(words & MEASURED_WORDS) + 3 * other
+
+
+def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:
+    """Return the names in a header that count the joints, with a star for the number from 1."""
+    if only_numbers(header):
+        return {'q*': '#*'}
+    for name, first in product(
+        sorted(header, key=lambda each: (_rank(each), len(words_of(each)))), (1, 0)
+    ):
+        for one in re.finditer(str(first), name):
+            before, after = name[: one.start()], name[one.end() :]
+            like = [f'{before}{k}{after}' for k in range(first, joints + first)]
+            if {*like} <= {*header}:
+                count = dict(zip(joint_columns(joints), like, strict=True))
+                return {'q*': f'{before}*{after}'} if first else count
+    return {}

@@ -27,16 +27,10 @@ from calib_ros.errors import ColumnsError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import Codes, Columns, columns_of
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.headers import (
-    commanded,
-    joints_left_out,
-    like_joints,
-    name_and_unit,
-    not_read,
-)
+from calib_ros.files.headers import joints_left_out, name_and_unit, not_read
 from calib_ros.files.journal import columns, of_journal
 from calib_ros.files.measurements import Measurements, distinct_rows, measurements
-from calib_ros.files.names import in_doubt, option, quaternions_in, turns_in
+from calib_ros.files.names import in_doubt, like_joints, option, quaternions_in, turns_in
 from calib_ros.files.skipped import measured, without_statistics
 from calib_ros.files.vocabulary import MATRIX, POSITION, QUATERNION, TURNS, WORDS, joint_columns
 from calib_ros.kinematics.se3 import Index
@@ -88,10 +82,8 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
         meant |= {name: ours for ours, name in quaternions_in(found.header).items()}
     cells = {meant.get(name, name): given for name, given in found.cells.items()}
     found = replace(found, cells=cells)
-    doubt = in_doubt(found.header, [name for name in POSITION if name in cells])
-    if not doubt and 'q1' in cells:
-        doubt = commanded(found.header, joints)
-    if doubt:
+    plain = [name for name in POSITION if name in cells]
+    if doubt := in_doubt(found.header, plain, joints * ('q1' in cells)):
         raise ColumnsError(f'{path}: {doubt}')
     found, left = without_statistics(found)
     kept, skipped = measured(found)
