@@ -77,10 +77,8 @@ class Foreign:
             made = replace(made, cells={**joints, **made.cells})
         if not self.layout.source:  # a preset is known to leave some out
             notes += not_read(path, [name for name in table.unread() if name != matched])
-            turns = (
-                '' if {*QUATERNION, *TURNS, *IN_TURN} & {*made.cells} else turns_in(table.names)
-            )
-            notes += [f'{path}: {turns}'] * bool(turns)
+            if not {*QUATERNION, *TURNS, *IN_TURN} & {*made.cells}:
+                notes += turns_in(path, table.names)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
         made, skipped = measured(made)
@@ -188,13 +186,11 @@ class _Table:
             column = only(found, name)
             bare, unit = name_and_unit(self._sheet.header[column])
             rate = JOINT.fullmatch(ours) and ours[0] in 'sva'
-            if rate and bare != name:
-                continue  # the axes of KUKA are A1, A2, ...: no accelerations
             other = rate or ours in (*WORDS, *SIGMAS, 'time', 'delay')
-            if other and unit not in (*UNIT_SIGNS, *SECONDS):
-                continue
+            if (rate and bare != name) or (other and unit not in (*UNIT_SIGNS, *SECONDS)):
+                continue  # the axes of KUKA are A1, A2, ...: no accelerations
             number = f'#{column + 1}'
-            if ours == 'time' and self._has_dates(number):
+            if ours == 'time' and not self._has_number(number):  # but a date
                 continue
             kept[ours] = Expression.parse(number)
             if name != ours:
@@ -233,15 +229,16 @@ class _Table:
             if len(given) == len(moving):  # of an arm whose hand is kept level
                 pairs = [(a, b) for a, b in zip(moving, given, strict=True) if a != b]
                 texts = [f'{a}={self._columns[b].text}' for a, b in pairs]
-                option = ','.join([*texts, *(f'{a}=0' for a in still)])
-                advice = f'If these are the joints with motors: --columns "{option}"'
+                texts += [f'{a}=0' for a in still]
+                advice = f'If these are the joints with motors: --columns "{",".join(texts)}"'
             raise InputError(
                 f'{self.path} has no column for {", ".join(missing)}; {self.has}. {advice}'
             )
 
-    def _has_dates(self, number: str) -> bool:
+    def _has_number(self, number: str) -> bool:
+        """Tell whether the first cell of a column is a number or blank."""
         sheet = self._sheet.columns
-        return math.isinf(cell_number(sheet.texts(number)[0], sheet.decimal))
+        return not math.isinf(cell_number(next(iter(sheet.texts(number)), ''), sheet.decimal))
 
     @property
     def has(self) -> str:

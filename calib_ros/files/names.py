@@ -5,8 +5,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
+from pathlib import Path
 
 from calib_ros.files.vocabulary import IN_TURN, POSITION, QUATERNION, TURNS, joint_columns
 
@@ -127,14 +128,14 @@ def option(ours: Iterable[str], *theirs: Iterable[str]) -> str:
     return f'--columns "{",".join(given)}"'
 
 
-def turns_in(header: Sequence[str]) -> str:
-    """Return how to use the angles of a header, by their names; empty without any."""
+def turns_in(path: Path, header: Sequence[str]) -> Iterator[str]:
+    """Yield how to use the angles of a header, by their names."""
     words = {tuple(words_of(name)): name for name in header}
     for angles, (ours, euler) in EULER.items():
         found = [words.get((angle,), '') for angle in angles]
         if all(found):
-            return f'to use {", ".join(found)}, give {option(ours, found)} --euler {euler}'
-    return ''
+            yield f'{path}: to use {", ".join(found)}, give {option(ours, found)} --euler {euler}'
+            return
 
 
 def named_in(header: Sequence[str], joint: str) -> str:

@@ -114,13 +114,14 @@ def _of_text(path: Path, layout: Layout) -> _Content:
         comments, text = comment.findall(text), comment.sub('', text)
     # a header, as numpy and SpatialAnalyzer write it
     text = re.sub(r'(?m)^(?:[#%]+[ \t]+|//[ \t]*)(?=[A-Za-z])', '', text)
-    guessed = _separator(path, text, notes if not layout.cut else [])
-    separator = layout.cut or guessed
+    guessed = _separator(path, text)
+    if guessed != 'comma' and not layout.cut:
+        notes.append(f'cells are separated by {guessed}s (--separator)')
+    separator = layout.cut or SEPARATORS[guessed]
     narrow = _narrow(text, separator)
-    if separator not in narrow and guessed in text.lstrip().partition('\n')[0]:
-        name = next(name for name, mark in SEPARATORS.items() if mark == guessed)
+    if separator not in narrow and SEPARATORS[guessed] in text.lstrip().partition('\n')[0]:
         raise InputError(
-            f'{path} separates its cells by {name}s: give --separator {name}'
+            f'{path} separates its cells by {guessed}s: give --separator {guessed}'
             + ', or to --joints-preset a layout of your own' * bool(layout.source)
         )
     return _Content(_rows_of_text(path, narrow, separator), notes, comments=comments)
@@ -159,7 +160,8 @@ def _sheet(
     header = _with_units(header, [cells for _, cells in head[at + 1 : first]])
     above = ['\t'.join(cells) for _, cells in head[: first if at < 0 else at]]
     left: list[int] = []
-    body = _without_words(chain([whole[first:]], rows), head[at:first], left)
+    again = [cells for _, cells in head[at:first]]
+    body = _without_words(chain([whole[first:]], rows), again, left)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
     if at >= 0 and max(used, default=0) < len(header):
         _refuse_shifted(columns, len(header))
@@ -172,18 +174,15 @@ def _sheet(
 
 
 def _without_words(
-    blocks: Iterable[list[Cells]], head: Sequence[Cells], left: list[int]
+    blocks: Iterable[list[Cells]], head: Sequence[list[str]], left: list[int]
 ) -> Iterator[list[Cells]]:
     """Yield the rows but comments, remarks and the `head` again, whose lines go into a list."""
-    again = [cells for _, cells in head]
     for block in blocks:
         words = [
             line
             for line, cells in block
             if (
-                len(cells) - cells.count('') <= 2
-                or cells[0].startswith(COMMENTS)
-                or cells in again
+                len(cells) - cells.count('') <= 2 or cells[0].startswith(COMMENTS) or cells in head
             )
             and not any(_is_number(cell, ',') for cell in cells)
         ]
@@ -206,7 +205,7 @@ def _refuse_shifted(columns: Columns, width: int) -> None:
 def text_and_separator(path: Path) -> tuple[str, str]:
     """Return the text of a table, and the sign between its cells."""
     text, _ = _text(path)
-    separator = _separator(path, text, [])
+    separator = SEPARATORS[_separator(path, text)]
     narrow = _narrow(text, separator)
     if separator in narrow.lstrip().partition('\n')[0]:
         return narrow, separator
@@ -230,14 +229,13 @@ def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tupl
     """Return the names of columns with their units in the lines below, known and unknown ones."""
     for cells in below:
         signs = [cell.strip('[]() ') for cell in cells]
+        whole = any(sign.lower() in UNIT_SIGNS for sign in signs)  # are units, not names
         units = [
-            UNIT_SIGNS.get(sign.lower()) or name_and_unit(cell)[1]
-            for sign, cell in zip(signs, cells, strict=True)
+            UNIT_SIGNS.get(s.lower())
+            or name_and_unit(c)[1]
+            or s * (whole and s.lower() not in MISSING)
+            for s, c in zip(signs, cells, strict=True)
         ]
-        if any(sign.lower() in UNIT_SIGNS for sign in signs):  # a line of units, not of names
-            units = [
-                u or s * (s.lower() not in MISSING) for u, s in zip(units, signs, strict=True)
-            ]
         pairs = zip_longest(header, units[: len(header)])
         header = tuple(
             f'{name} [{unit}]' if unit and name and not name_and_unit(name)[1] else name
@@ -315,7 +313,7 @@ def _cell(value: object) -> str:
     return ' '.join(text.split())
 
 
-def _separator(path: Path, text: str, notes: list[str]) -> str:
+def _separator(path: Path, text: str) -> str:
     head = text.split('\n', HEAD_LINES)[:HEAD_LINES]
     cut = re.sub('"[^"\n]*"', '0', '\n'.join(head)).split('\n')  # cells in quotes
     lines = [line for line in cut if line.strip()][-30:]  # mostly below the header
@@ -332,9 +330,7 @@ def _separator(path: Path, text: str, notes: list[str]) -> str:
         below = [cell for row in rows[len(rows) // 2 :] for cell in row]  # the header
         if agreed > 1.2 * most or (finer and all(_is_number(cell, '.') for cell in below)):
             best, most, cells = name, agreed, usual
-    if best != 'comma':
-        notes.append(f'cells are separated by {best}s (--separator)')
-    return SEPARATORS[best]
+    return best
 
 
 def _header(
@@ -380,13 +376,13 @@ def _first(
                 notes.append(f'there are no numbers in {left}: only units are read')
             return k
     none = [f'{path} has no rows of numbers in the columns named']
-    for line, cells in rows[at + 1 : at + 2]:
-        none += [
-            f'line {line} has "{cells[i]}": numbers without units are expected there; other '
-            'columns are named by --columns OURS=NAME or OURS=#NUMBER'
-            for i in used[:1]
-            if i < len(cells)
-        ]
+    none += [
+        f'line {line} has "{cells[i]}": numbers without units are expected there; other columns '
+        'are named by --columns OURS=NAME or OURS=#NUMBER'
+        for line, cells in rows[at + 1 : at + 2]
+        for i in used[:1]
+        if i < len(cells)
+    ]
     raise InputError('; '.join([*none, *notes]))
 
 

@@ -98,8 +98,7 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
         notes.append(
             f'{path}: {turns} are left out: give --euler or --rotation-vector to use them'
         )
-    turns = turns_in([name_and_unit(name)[0] for name in found.header])
-    notes += [f'{path}: {turns}'] * bool(turns)
+    notes += turns_in(path, [name_and_unit(name)[0] for name in found.header])
     known = {*columns(joints), *TURNS, 'plane', f'q{joints + 1}'}
     return kept, (*notes, *not_read(path, [name for name in cells if name not in known]))
 

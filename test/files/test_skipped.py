@@ -38,6 +38,15 @@ def test_statistics_below_a_table_are_no_poses(tmp_path, rows):
         assert any('statistics in line' in note for note in table.warnings)
 
 
+def test_statistics_without_a_table_are_refused(tmp_path):
+    """Of stamps it was an IndexError."""
+    path = tmp_path / 'cell.csv'
+    path.write_text('point,time,q1,q2,x,y,z\nmean,1,0.1,0.2,0.3,0.4,0.5\n')
+    for foreign in (None, Foreign(Layout(), ARM)):
+        with pytest.raises(InputError, match='no rows'):
+            read_table(path, 2, foreign=foreign)
+
+
 @pytest.mark.parametrize('count', [1, 3])
 def test_a_name_that_comes_again_or_before_others_is_no_statistic(tmp_path, count):
     path = tmp_path / 'cell.csv'
