@@ -220,11 +220,8 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, t
     if posed:
         check_quaternions(found, values[:, 3:])
         values = joints_of_poses(values[:, :3], se3.from_quat(values[:, 3:]))
-    return (
-        dict(zip(names, values, strict=True)),
-        posed,
-        joints_left_out(path, found.header, joints),
-    )
+    left_out = joints_left_out(path, found.header, joints)
+    return dict(zip(names, values, strict=True)), posed, left_out
 
 
 def observed(

@@ -144,6 +144,8 @@ class _Table:
         if not alone:
             own |= {name: name for name in (*NUMBERS, *WORDS)}
         self._sheet = read_sheet(path, layout, list(needed), list(own))
+        self.names = tuple(name_and_unit(name)[0] for name in self._sheet.header)
+        self.has = f'it has {listed(self._sheet.header)}'
         kept, left = without_statistics(self._sheet.columns)
         self._sheet, self.count = replace(self._sheet, columns=kept), len(kept.lines)
         self.notes = [*self._sheet.notes, *left]
@@ -239,16 +241,6 @@ class _Table:
         """Tell whether the first cell of a column is a number or blank."""
         sheet = self._sheet.columns
         return not math.isinf(cell_number(next(iter(sheet.texts(number)), ''), sheet.decimal))
-
-    @property
-    def has(self) -> str:
-        """Return in words which columns there are."""
-        return f'it has {listed(self._sheet.header)}'
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the names of the columns without their units."""
-        return tuple(name_and_unit(name)[0] for name in self._sheet.header)
 
     def unread(self) -> list[str]:
         """Return the names of the columns that nothing is made of."""

@@ -11,7 +11,7 @@ from calib_ros.errors import LONGEST, ColumnsError, InputError, shortened
 from calib_ros.files.names import (
     MEASURED_WORDS,
     NOMINAL_WORDS,
-    is_distance,
+    distance_in,
     like_joints,
     named_in,
     only_numbers,
@@ -124,12 +124,10 @@ def named_by_option(
             like, free = dict(zip(names, theirs, strict=True)), {*header} - {*theirs}
             found |= {n: 'NAME' for n in POSITION if not {n, found.get(n, '')} & free}
     if {*POSITION} <= {*missing}:
-        wires = [*filter(is_distance, header)]
         if found['x'] != 'NAME':
             found |= quaternions_in(header, sure=False)
-        elif len(wires) == 1:
-            found = {n: each for n, each in found.items() if n not in POSITION}
-            found['distance'] = wires[0]
+        elif wire := distance_in(header):
+            found = {n: each for n, each in found.items() if n not in POSITION} | wire
     if (unit := words_of(found.get('x', ''))[1:]) in (['m'], ['in']):  # X_in is not read as a unit
         more = f' --length {unit[0]}{more}'
     found = (like or ({'q*': 'NAME*'} if whole else dict.fromkeys(lacking, 'NAME'))) | found

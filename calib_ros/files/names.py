@@ -73,10 +73,11 @@ def _one(found: Mapping[frozenset[str], Sequence[str]]) -> Sequence[str]:
     return next((each[0] for each in (measured, plain, [*found.values()]) if len(each) == 1), ())
 
 
-def is_distance(name: str) -> bool:
-    """Tell whether a name is that of a measured distance."""
-    words = {*words_of(name)}
-    return bool(words & DISTANCE_WORDS) and not words & (NOMINAL_WORDS | DEVIATION | OTHER)
+def distance_in(header: Sequence[str]) -> dict[str, str]:
+    """Return the name of the only measured distance."""
+    known = [name for name in header if DISTANCE_WORDS & {*words_of(name)}]
+    wires = [name for name in known if not (NO_PLACE - TURNED) & {*words_of(name)}]
+    return {'distance': wires[0]} if len(wires) == 1 else {}
 
 
 def positions_in(header: Sequence[str], missing: Sequence[str]) -> dict[str, str]:
@@ -169,6 +170,7 @@ def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:
             before, after = name[: one.start()], name[one.end() :]
             like = [f'{before}{k}{after}' for k in range(first, joints + first)]
             if {*like} <= {*header}:
-                count = dict(zip(joint_columns(joints), like, strict=True))
-                return {'q*': f'{before}*{after}'} if first else count
+                if first:
+                    return {'q*': f'{before}*{after}'}
+                return dict(zip(joint_columns(joints), like, strict=True))
     return {}

@@ -340,10 +340,10 @@ def _header(
     rows = rows[:HEAD_LINES]
     words = [sum(not _is_number(c, ',') for c in cells if c) for _, cells in rows]
     at = words.index(max(words))  # title and data have fewer
-    bare = [{name_and_unit(cell)[0] for cell in cells} for _, cells in rows]
+    bare = [{*cells, *(name_and_unit(cell)[0] for cell in cells)} for _, cells in rows]
     wanted = {name for name in names if not name.startswith('#')}
     if wanted:
-        missing = [wanted - each - {*cells} for each, (_, cells) in zip(bare, rows, strict=True)]
+        missing = [wanted - each for each in bare]
         fewest = min(missing, key=len)
         if len(fewest) < len(wanted):
             at = missing.index(fewest)
