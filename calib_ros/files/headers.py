@@ -109,18 +109,17 @@ def named_by_option(
         return f'Its first line holds numbers, not names: {given}, in its order'
     names = joint_columns(joints)
     lacking = [name for name in names if name in missing]
-    whole = bool(joints) and len(lacking) == joints
+    whole = 0 < joints == len(lacking)
     fewer = bool(lacking) and 'q1' in header and 'q0' not in header
     like = like_joints(header, joints) if lacking and not fewer else {}
     more = '; joint values in another file: --joints FILE' if whole and not like else ''
     found = dict.fromkeys([name for name in missing if name not in lacking], 'NAME')
     found |= positions_in(header, [name for name in POSITION if name in missing])
     if more and called:
-        rest = [each for each in header if each and each.lower() not in (*NUMBERS, *WORDS)]
-        theirs = [named_in(header, name) for name in called]
-        if len(rest) == joints and {*POSITION} <= {*header}:
-            like = dict(zip(names, rest, strict=True))
-        elif all(theirs):
+        theirs = [each for each in header if each and each.lower() not in (*NUMBERS, *WORDS)]
+        if len(theirs) != joints or not {*POSITION} <= {*header}:
+            theirs = [named_in(header, name) for name in called]
+        if all(theirs):
             like, free = dict(zip(names, theirs, strict=True)), {*header} - {*theirs}
             found |= {n: 'NAME' for n in POSITION if not {n, found.get(n, '')} & free}
     if {*POSITION} <= {*missing}:
