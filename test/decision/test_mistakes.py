@@ -284,29 +284,6 @@ def test_a_chain_file_in_millimetres_is_named(b):
     assert 'the lengths of the chain file are in mm, not metres' in named
 
 
-@pytest.mark.parametrize(
-    ('kind', 'which', 'accepted'),
-    [
-        ('a', ['joint_2'], False),
-        ('d', ['joint_3'], False),
-        ('alpha', ['joint_3'], False),
-        ('a', ['joint_2', 'joint_3'], False),
-        ('a', ['joint_3'], True),  # 20 mm, which the fit finds
-    ],
-)
-def test_a_wrong_sign_in_the_dh_table_is_named(kind, which, accepted):
-    puma = load_chain('puma560')
-    own = [replace(j, a=1.1 * j.a, d=1.1 * j.d) for j in puma.joints]  # no supplied arm
-    arm = replace(puma, joints=tuple(own), name='own')
-    rows = [replace(j, **{kind: -getattr(j, kind)}) if j.name in which else j for j in arm.joints]
-    wrong = replace(arm, joints=tuple(rows), parallel=None)
-    found = identify(Problem(wrong, seen_of(arm)))
-    assert found.accepted == accepted
-    said = found.remarks if accepted else found.refusals
-    of = which[0] if len(which) == 1 else 'all joints'
-    assert f'{kind} of {of} has the other sign: correct {kind} in the chain file' in said[0]
-
-
 @pytest.mark.parametrize(('stated', 'remarks'), [(0.1, 0), (0.01, 1)])
 def test_orientations_that_do_not_fit_are_a_remark_where_the_rest_is_accepted(stated, remarks):
     """Of a small target, say: 0.1 rad; nothing is said if that is what was stated."""

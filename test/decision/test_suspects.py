@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from fits import SCARA
 
-from calib_ros import load_chain
-from calib_ros.apply.simulation import measure
+from calib_ros import Problem, identify, load_chain
+from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.printed_board import size_of
 from calib_ros.decision.suspects import hidden, suspects
 from calib_ros.decision.undoing import Suspect
@@ -255,3 +255,28 @@ def test_a_board_that_is_seen_in_one_place_has_no_size(seed):
     seen = measure(arm, arm.random_joints(20, rng), rng)
     assert size_of(arm, seen) == pytest.approx(1.0)
     assert size_of(arm, replace(seen, positions=np.zeros_like(seen.positions))) == 1.0
+
+
+@pytest.mark.parametrize(
+    ('kind', 'which', 'accepted'),
+    [
+        ('a', ['joint_2'], False),
+        ('d', ['joint_3'], False),
+        ('alpha', ['joint_3'], False),
+        ('a', ['joint_2', 'joint_3'], False),
+        ('a', ['joint_3'], True),  # 20 mm, which the fit finds
+    ],
+)
+def test_a_wrong_sign_in_the_dh_table_is_named(kind, which, accepted, rng):
+    puma = load_chain('puma560')
+    own = [replace(j, a=1.1 * j.a, d=1.1 * j.d) for j in puma.joints]  # no supplied arm
+    arm = replace(puma, joints=tuple(own), name='own')
+    rows = [replace(j, **{kind: -getattr(j, kind)}) if j.name in which else j for j in arm.joints]
+    wrong = replace(arm, joints=tuple(rows), parallel=None)
+    true = faulty(arm, Cell(), rng)
+    seen = measure(true, arm.random_joints(40, rng), rng, 5e-5, 2e-4)
+    found = identify(Problem(wrong, seen))
+    assert found.accepted == accepted
+    said = found.remarks if accepted else found.refusals
+    of = which[0] if len(which) == 1 else 'all joints'
+    assert f'{kind} of {of} has the other sign: correct {kind} in the chain file' in said[0]
