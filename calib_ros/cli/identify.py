@@ -51,8 +51,9 @@ from calib_ros.settings import Settings
 from calib_ros.shown import of_them, rounded
 from calib_ros.texts import dump_json
 
-REPORTS = ('report.html', 'report.md', 'report.pdf', 'residuals.csv', 'before_after.png')
-RESULT_FILES = ('calibration.yaml', 'result.json', 'settings.yaml', *REPORTS)
+PAGES = ('report.html', 'report.md', 'residuals.csv', 'before_after.png')
+RESULT_FILES = ('calibration.yaml', 'result.json', 'settings.yaml', *PAGES)
+REPORTS = (*PAGES, 'report.pdf')
 OF_UPDATES = ('new_base', 'new_tool')
 NOT_OF_UPDATES = ('history', 'tolerance', 'pdf', 'model', 'fixed', 'priors')
 
@@ -70,7 +71,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if update:
         return _recalibrated(options, screen)
     filed = inputs.history_of(options)
-    with common.output_files(options, RESULT_FILES) as contents:
+    with common.output_files(options, (*RESULT_FILES, *REPORTS)) as contents:
         found = _identified(options, screen)
         if options.out is not None:
             contents |= result_files(found, screen, options.out, options.pdf)
