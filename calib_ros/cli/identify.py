@@ -71,7 +71,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if update:
         return _recalibrated(options, screen)
     filed = inputs.history_of(options)
-    with common.output_files(options, (*RESULT_FILES, *REPORTS)) as contents:
+    with common.output_files(options, (*RESULT_FILES, 'report.pdf')) as contents:
         found = _identified(options, screen)
         if options.out is not None:
             contents |= result_files(found, screen, options.out, options.pdf)

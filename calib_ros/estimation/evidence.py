@@ -165,6 +165,7 @@ def posterior_of(
     if judges_scale and (checked or scale < PRINTED):
         elsewhere = evidence_of(known, max(OUT_OF_SCALE, scale))
         odds, mean, covariance = elsewhere.against(evidence, size, considered)
+        # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
         odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
         rival, out = (odds, mean[arm], covariance[arm, arm]), float(mean[-1])
     near = evidence.near(size, slope) if judging else []
