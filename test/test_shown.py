@@ -110,7 +110,7 @@ def test_results_are_read_only():
                 ('largest_error', np.nan, 'of type float, not nan'),
                 ('sigma_position', 0.0, 'a positive number, not 0.0'),
                 ('sigma_touch', np.inf, 'a positive number'),
-                ('sigma_scale', 1.0, 'from 0 to 1, not 1.0'),
+                ('sigma_scale', 1.0, 'at least 0 and below 1, not 1.0'),
                 ('folds', 1, 'at least 2, not 1'),
             )
         ),

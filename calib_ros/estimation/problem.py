@@ -148,7 +148,7 @@ class Problem(Shown):
                 'can cause: are they in metres (--length)?'
             )
         turns = np.abs(joints[:, [joint.type != 'prismatic' for joint in self.chain.joints]])
-        if turns.size and np.percentile(turns, 75.0) > 2.0 * np.pi:
+        if turns.size and np.median(np.percentile(turns, 75.0, axis=0)) > 2.0 * np.pi:
             doubts.append(
                 'many joint values are beyond a whole turn: are they in degrees '
                 '(--joint-angle deg)?'

@@ -230,5 +230,5 @@ def test_joint_values_in_degrees_are_told_beside_distances(rng):
     with pytest.raises(InputError, match=r'\(--length\)\? Also, many .* \(--joint-angle deg\)'):
         Problem(UR10E, replace(wrong, distances=1e3 * seen.distances), **SIGMAS)
     endless = seen.joints.copy()
-    endless[:, 5] += 20 * np.pi
+    endless[:, 4:] += 20 * np.pi  # a third of the joints, as the flange of a SCARA
     Problem(UR10E, replace(seen, joints=endless), **SIGMAS)
