@@ -3,9 +3,11 @@
 """Arms, what is wrong with them, and sessions: numpy alone, no kinematics of calib_ros.
 
 An arm is read from the table in config/robots. Gravity, eccentricities of joints and ripple of
-gears move its joints by what no geometric model holds:
+gears move its joints by what no geometric model holds,
 
     q_true = q + softness * torque(q) + sum_k amplitude_k sin(order_k q + phase_k)
+
+and axes wobble: they tilt about x and y by amplitude sin(order q + phase).
 """
 
 from dataclasses import dataclass, replace
@@ -41,7 +43,8 @@ class Arm:
     """An arm in its cell: rows of a, alpha, d, theta, beta [m, rad] and what bends.
 
     `base` and `tool` are (rotation, position), `weights` [N] hang at the ends of the links,
-    `softness` [rad/(N m)] is of the joints; `waves` holds (order, amplitudes (n,), phases (n,)).
+    `softness` [rad/(N m)] is of the joints; `waves` holds (order, amplitudes (n,), phases (n,)),
+    `wobble` (order, amplitudes (n, 2), phases (n, 2)) or nothing.
     """
 
     convention: str
@@ -53,6 +56,7 @@ class Arm:
     weights: np.ndarray
     softness: np.ndarray
     waves: tuple = ()
+    wobble: tuple = ()
 
     @classmethod
     def read(cls, name):
@@ -81,11 +85,17 @@ class Arm:
         rotation, origin = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
         axes, pivots, ends = [], [], []
         angles = self.table[:, 3] + self.signs * q
-        for (a, alpha, d, _, beta), angle in zip(self.table, angles.T, strict=True):
+        for k, ((a, alpha, d, _, beta), angle) in enumerate(
+            zip(self.table, angles.T, strict=True)
+        ):
             if self.convention == 'modified':
                 rotation = rotation @ turn(0, alpha)
                 origin = origin + a * rotation[:, :, 0]
                 rotation = rotation @ turn(1, beta)
+            if self.wobble:
+                order, amplitudes, phases = self.wobble
+                tilt = amplitudes[k] * np.sin(order * q[:, k, None] + phases[k])
+                rotation = rotation @ turn(0, tilt[:, 0]) @ turn(1, tilt[:, 1])
             axes.append(rotation[:, :, 2])
             pivots.append(origin)
             rotation = rotation @ turn(2, angle)
@@ -156,6 +166,12 @@ class Arm:
         drawn = [(rng.uniform(0.3, 1.0, count), rng.uniform(0.0, 6.28, count)) for _ in orders]
         waves = tuple((order, size * a, p) for order, (a, p) in zip(orders, drawn, strict=True))
         return replace(self, waves=waves)
+
+    def wobbling(self, size, rng):
+        """Return the arm with axes that tilt by `size` [rad] (RMS of the amplitudes)."""
+        amplitudes = rng.normal(scale=size, size=(len(self.table), 2))
+        phases = rng.uniform(0.0, 6.28, amplitudes.shape)
+        return replace(self, wobble=(int(rng.integers(1, 3)), amplitudes, phases))
 
 
 def misfit(wanted, rotation, position):
@@ -264,7 +280,7 @@ def poses(arm, order, count, rng):
 
 def lines(arm, count, rng):
     """Return joint values (count, n) on straight lines, all at one orientation."""
-    plain = replace(arm, softness=0.0 * arm.softness, waves=())
+    plain = replace(arm, softness=0.0 * arm.softness, waves=(), wobble=())
     for _ in range(50):
         home = home_of(arm, rng)
         rotation, place = plain.forward(home[None])

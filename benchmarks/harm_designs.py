@@ -16,6 +16,7 @@ from calib_ros.kinematics.chain_file import load_chain
 
 NOISE = (5e-5, 2e-4)
 GOOD = 1e-4
+WOBBLE = 3e-5, 2e-4  # of axes [rad], as measured robots have
 SIX = ('ur10', 'puma560', 'staubli_tx90l')
 SEVEN = ('kuka_iiwa14', 'franka_panda')
 LINES = ('ur10', 'puma560', 'kuka_iiwa14')
@@ -70,6 +71,10 @@ DESIGNS = (
         Design(f'{bend}, {order}', 60, (order,), ('none', 'small', 'usual'), bends=(bend,))
         for bend in ('soft', 'wavy')
         for order in ('local', 'half', 'random')
+    ),
+    *(
+        Design(f'wobbling, {order}', 60, (order,), ('none', 'small', 'usual'), bends=('wobbling',))
+        for order in ('local', 'half', 'sweeps', 'random')
     ),
     *(
         Design(f'{what} moved, {size} mm', 72, ORDERS, what=what, size=1e-3 * size)
@@ -140,6 +145,8 @@ def session(design, number):
         bare = nominal.wavy((RIPPLE,), 1e-3, rng) if bend == 'ripple' else bare
         size = rng.uniform(1e-4, 2e-4) if bend == 'ripple' else rng.uniform(2e-4, 1e-3)
         arm = replace(arm, **{field: getattr(resized(nominal, bare, field, size), field)})
+    if bend == 'wobbling':
+        arm = arm.wobbling(10.0 ** rng.uniform(*np.log10(WOBBLE)), rng)
     q = poses(nominal, order, count, rng)
     if design.what.startswith('still'):
         still = rng.permutation(q.shape[1])[: 5 if design.what == 'still five' else 1]

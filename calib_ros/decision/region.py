@@ -8,8 +8,8 @@ the arm worse if
 
     |A (x^ - x)|^2 > |A x|^2    <=>    (A x^)^T (A x) < |A x^|^2 / 2
 
-The probability of that is the *risk*; docs/model.md (Region) describes the poses it is computed
-for.
+Waves of its axes are among x, and x^ has none. The probability of that is the *risk*;
+docs/model.md (Region) describes the poses it is computed for.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from scipy import special
 from calib_ros.decision.drift import inverse_root
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.estimation.evidence import Mixed, Posterior
-from calib_ros.estimation.joint_errors import NOTHING
+from calib_ros.estimation.joint_errors import NOTHING, moved, moving, waved
 from calib_ros.estimation.levels import KNOWN
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import ROUNDING, Flags, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, Flags, FloatArray
 from calib_ros.shown import Shown
 
 RISK = 0.02
@@ -191,10 +191,11 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
     drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
     judge = _Judge(posterior, *ends, freedom)
-    rows = judge.model.shifts(np.concatenate([drawn, measured]))
+    rows = judge.rows(np.concatenate([drawn, measured]))
     known = rows[: len(posterior.names)]
     squares = np.einsum('pcn,pcn->n', np.tensordot(posterior.square, known, 1), known)
     sizes = np.sqrt(np.maximum(squares, 0.0))  # of the expected errors
+    sizes *= 1.0 + HALF_THE_DIGITS  # as rounded, also in the record
     far, limit = sizes[:SOME_POSES], float(sizes[SOME_POSES:].max())
     order = np.argsort(far)
     own, inside = judge.products(rows[..., SOME_POSES:]), far[order] <= limit
@@ -231,20 +232,28 @@ class _Judge:
 
     def __init__(self, posterior: Posterior, base: str, tool: str, freedom: float) -> None:
         chain, names = posterior.chain, posterior.names
-        self._arm = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
+        arm = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
         frames = [*parameters_of(base), *parameters_of(tool)[:3]]
         self._placed, self._freedom = len(frames), freedom
-        every = list(dict.fromkeys([*names, *frames]))
-        self.model = ErrorModel(chain, every, base, tool)  # then further frame parameters
-        self._own = [*map(every.index, frames), *self._arm]
-        self._offsets = posterior.offsets[self._arm]
+        every = list(dict.fromkeys([*names, *frames, *moving(chain)]))
+        self._model, self._waves = ErrorModel(chain, every, base, tool), posterior.unmodelled.waves
+        waves = range(len(posterior.doubted[0][1]) - len(names))
+        self._arm = [*arm, *(len(names) + k for k in waves)]
+        self._own = [*map(every.index, frames), *arm, *(len(every) + k for k in waves)]
+        self._offsets = np.append(posterior.offsets[arm], np.zeros(len(waves)))
+
+    def rows(self, joints: FloatArray) -> FloatArray:
+        """Return the columns (K, 3, N) of the posterior's names, of others, and of waves."""
+        rows = self._model.shifts(joints)
+        _, tilts = moved(self._model.chain, self._model.names, rows)
+        return np.concatenate([rows, self._waves * waved(tilts, joints)])
 
     def products(self, rows: FloatArray) -> FloatArray:
         """Return products (K, K) of the columns of frames, then of the arm, from all rows."""
         return gram(rows[self._own])
 
     def of_the_arm(self, doubted: Sequence[Mixed]) -> _Doubts:
-        """Return plausible offsets, as in `Posterior.doubted`, for the arm only."""
+        """Return plausible offsets and waves, as in `Posterior.doubted`, for the arm only."""
         weights, means, covariances = zip(*doubted, strict=True)
         arm = np.ix_(self._arm, self._arm)
         own = np.array([each[arm] for each in covariances])

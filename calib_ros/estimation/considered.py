@@ -65,21 +65,23 @@ class Doubts:
 
     Parameters by `sizes` that something else moves too, all `lengths` together with the scale of
     the device, smooth errors of the device if `by_device`, and `unmodelled` waves beside what the
-    parameters follow of them.
+    parameters follow of them; if `kept`, waves are no doubts but parameters, in units of their
+    size.
     """
 
     sizes: Mapping[str, float] = field(default_factory=dict)
     lengths: Mapping[str, float] = field(default_factory=dict)
     by_device: bool = False
     unmodelled: Unmodelled = NOTHING
+    kept: bool = False
 
 
 class Doubted(NamedTuple):
     """Products of columns and residual (Q, Q), and with K doubtful columns (Q, K) and (K, K).
 
-    The columns are those of the parameters, of the device's scale if there are lengths, and of the
-    residual. Doubtful ones are scaled by their standard deviations; their own products have 1
-    added.
+    The columns are those of the parameters, of waves if kept, of the device's scale if there are
+    lengths, and of the residual. Doubtful ones are scaled by their standard deviations; their own
+    products have 1 added.
     """
 
     plain: FloatArray
@@ -111,7 +113,7 @@ def doubted_products(
     few = system.spread(most)
     products = share * _products(chain, columns, few, doubts)
     extra = np.column_stack(system.separation_rows(chain, columns))
-    own = len(columns) + 1
+    own, count = len(columns) + 1, len(names)
     products[:own, :own] += share * (extra.T @ extra)
     every = np.eye(len(products))
     row = {str(name): k for k, name in enumerate(columns)}
@@ -120,8 +122,9 @@ def doubted_products(
         return every[:, [row[str(name)] for name in sizes]] * [*sizes.values()]
 
     grown = scaled(doubts.lengths).sum(axis=1, keepdims=True)[:, : len(doubts.lengths)]
-    kept = np.column_stack([every[:, : len(names)], grown, every[:, own - 1]])
-    mixing = np.column_stack([kept, scaled(doubts.sizes), every[:, own:]])
+    end = own + _waves(chain, doubts) * doubts.kept
+    kept = np.column_stack([every[:, :count], every[:, own:end], grown, every[:, own - 1]])
+    mixing = np.column_stack([kept, scaled(doubts.sizes), every[:, end:]])
     mixed = mixing.T @ (products / noise**2) @ mixing
     first, rest = np.s_[: kept.shape[1]], np.s_[kept.shape[1] :]
     doubtful = mixed[rest, rest]
@@ -150,11 +153,16 @@ def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], f
     return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}, scale
 
 
+def _waves(chain: Chain, doubts: Doubts) -> int:
+    return 8 * len(chain.joints) if doubts.unmodelled.waves else 0
+
+
 def _products(chain: Chain, columns: Sequence[str], system: System, doubts: Doubts) -> FloatArray:
     """Return products of columns, residual, waves and smooth device errors."""
     unmodelled = doubts.unmodelled
-    fields = bends(system.sets) if doubts.by_device else []
-    waves = 8 * len(chain.joints) if unmodelled.waves else 0
+    none = [np.zeros((0, samples.width, samples.count)) for samples in system.sets]
+    fields = bends(system.sets) if doubts.by_device else none
+    waves = _waves(chain, doubts)
     if not (any(map(len, fields)) or waves):
         return np.asarray(products_of(chain, columns, system)[0].sum(axis=0))
     found = np.zeros((len(columns) + len(fields[0]) + waves + 1,) * 2)

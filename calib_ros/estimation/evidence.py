@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -69,9 +69,9 @@ class Posterior(Shown):
     """(P, K), square root of the covariance that smooth errors of that device add."""
     priors: Mapping[str, float]  # standard deviation [m or rad] of parameters with a prior
     sizes: Mapping[str, float]  # size of the errors by group
-    doubted: tuple[Mixed, ...]
-    """The posterior of the offsets for each plausible set of sizes, if the device may have a
-    scale error and rounded joint values may be off."""
+    doubted: tuple[Mixed, ...] = ()
+    """The posterior of the offsets, then of waves in units of their size, for each plausible set
+    of sizes, if the device may have a scale error and rounded joint values may be off."""
     rival: Mixed | None = None
     """The same with log odds for a device out of scale, or further than `sigma_scale`; None of a
     printed board of unchecked scale, which may be."""
@@ -103,24 +103,25 @@ class Posterior(Shown):
 
         The first F fitted parameters follow them by `slopes` (F, K).
         """
-        count, between = len(names), len(self.names) - len(slopes)
-        along = np.concatenate([slopes, np.zeros((between, count)), np.eye(count)])
-        more = (along * self.stds_of(names) ** 2) @ along.T
-
-        def padded(matrix: FloatArray) -> FloatArray:
-            return np.asarray(np.pad(matrix, (0, count)) + more)
-
+        wider = replace(self, names=(*self.names, *names))
+        _, shift, covariance = wider.with_held((1.0, self.shift, self.covariance), names, slopes)
         return replace(
-            self,
-            names=(*self.names, *names),
-            offsets=np.pad(self.offsets, (0, count)),
-            shift=np.pad(self.shift, (0, count)),
-            covariance=padded(self.covariance),
-            device=np.pad(self.device, ((0, count), (0, 0))),
-            rival=None,  # nothing measures the scale
-            scale=0.0,
-            doubted=tuple((w, np.pad(m, (0, count)), padded(c)) for w, m, c in self.doubted),
+            wider,
+            offsets=np.pad(self.offsets, (0, len(names))),
+            shift=shift,
+            covariance=covariance,
+            device=np.pad(self.device, ((0, len(names)), (0, 0))),
         )
+
+    def with_held(self, each: Mixed, names: Sequence[str], slopes: FloatArray) -> Mixed:
+        """Return mean (Q,) and covariance (Q, Q) with the K held names inserted before waves."""
+        weight, mean, covariance = each
+        count, own = len(names), len(self.names) - len(names)
+        along = np.concatenate([slopes, np.zeros((own - len(slopes), count)), np.eye(count)])
+        place = [own] * count
+        covariance = np.insert(np.insert(covariance, place, 0.0, axis=0), place, 0.0, axis=1)
+        covariance[: own + count, : own + count] += (along * self.stds_of(names) ** 2) @ along.T
+        return weight, np.insert(mean, place, 0.0), covariance
 
     def held(self, name: str) -> float:
         """Return the share of a parameter's variance due to its prior, 1 if undetermined."""
@@ -141,81 +142,119 @@ def posterior_of(
     fit, and noise of size `noise` [sigma given]. `rounding` are standard deviations of parameters
     that rounded joint values move too. Plausible sizes and the device only count if `judging`.
     """
-    noise = max(noise, ROUNDING)  # parameters that follow all exactly leave none
-    problem, names, system = fitted.problem, fitted.names, fitted.system
-    nominal, every = problem.model, (*names, *more)
-    arm = np.s_[: len(every)]  # all columns but the scale of the device
-    own = [n for n in more if not (Parameter(n).of_dh or nominal.owns_frame(n))]
-    chain = fitted.chain.with_effects(own)
-    beside = {name: std for name, std in (rounding or {}).items() if name in names}
-    whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
-    sums = _sums_of(fitted, whole, every, Doubts(beside, lengths, bool(more)), noise)
-    offsets = np.append(fitted.offsets, np.zeros(len(sums.plain) - 1 - len(names)))
-    alone, along = _about_nominal(sums.plain, offsets)
-    matrix, vector = _about_nominal(sums.reduced, offsets)
-    columns = [*every, *['scale'] * bool(lengths)]
-    evidence_of = partial(_evidence_of, chain, columns, (matrix, vector))
-    known: dict[str, float] = {**problem.given} | {**lenses(nominal)}
-    checked = {'scale': problem.sigma_scale} if problem.sigma_scale else {}
-    evidence = evidence_of(known | checked, scale)
-    considered = {size_group(chain, name) for name in more}
-    considered -= {size_group(chain, name) for name in names if name not in known}
-    size, slope = evidence.most_probable(considered)
-    rival, out, judges_scale = None, 0.0, judging and lengths
-    if judges_scale and (checked or scale < PRINTED):
-        elsewhere = evidence_of(known, max(OUT_OF_SCALE, scale))
-        odds, mean, covariance = elsewhere.against(evidence, size, considered)
-        # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
-        odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
-        rival, out = (odds, mean[arm], covariance[arm, arm]), float(mean[-1])
+    columns = _Columns(fitted, noise, more, rounding)
+    evidence, arm, sums = columns.evidence(), columns.arm, columns.sums
+    size, slope = evidence.most_probable(columns.considered)
     near = evidence.near(size, slope) if judging else []
-    usual = zip(every, evidence.precision(size).tolist(), strict=False)
+    usual = zip(columns.names, evidence.precision(size).tolist(), strict=False)
     priors = {name: float(each**-0.5) for name, each in usual if each > 0.0}
     if judging:
         evidence.widen(size)
     weights, tried = zip(*(near or [(1.0, size)]), strict=True)
-    precisions = [evidence.precision(each) for each in tried]
-    each_alone = [solved(alone[arm, arm], along[arm], each[arm]) for each in precisions]
+    alone, along = columns.about_nominal(sums.plain)
+    precisions = [evidence.precision(each)[arm] for each in tried]
+    each_alone = [solved(alone[arm, arm], along[arm], each) for each in precisions]
     mean, covariance = mixed(each_alone, weights)
-    other = alone, sums.cross[:-1], sums.doubtful, evidence.precision(size), len(every)
-    device = _device(*other) if judging else np.zeros((len(every), 0))
-    wider = [solved(matrix, vector, each) for each in precisions if near]
-    parts = zip(weights, wider, strict=False)
-    doubted = tuple((w, centre[arm], root[arm] @ root[arm].T) for w, (centre, root) in parts)
-    out = float(wider[0][0][-1]) if judges_scale and not rival else out
-    found = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
-    posterior = Posterior(chain, every, *found, doubted, rival, out)
+    other = alone, sums.cross[:-1], sums.doubtful, evidence.precision(size), arm.stop
+    device = _device(*other) if judging else np.zeros((arm.stop, 0))
+    offsets = columns.offsets[arm]
+    found = offsets, mean - offsets, covariance, device, priors, evidence.named(size)
+    posterior = Posterior(columns.chain, columns.names, *found)
     return posterior if fitted.held is None else posterior.held_at(*fitted.held)
+
+
+def with_doubts(
+    posterior: Posterior,
+    fitted: Fitted,
+    noise: float,
+    more: Sequence[str],
+    rounding: Mapping[str, float] | None = None,
+) -> Posterior:
+    """Return the posterior of the same arguments with the arms that may have given the data.
+
+    Its axes may wobble by the `unmodelled` waves, and the device may be out of scale.
+    """
+    columns = _Columns(fitted, noise, more, rounding, posterior.unmodelled.waves)
+    evidence, arm, considered = columns.evidence(), columns.arm, columns.considered
+    size, slope = evidence.most_probable(considered)
+    matrix, vector = columns.about_nominal(columns.sums.reduced)
+    near = evidence.near(size, slope)
+    rival, scale, checked = None, 0.0, bool(fitted.problem.sigma_scale)
+    if columns.scaled and fitted.held is None and (checked or columns.scale < PRINTED):
+        elsewhere = columns.evidence(max(OUT_OF_SCALE, columns.scale))
+        odds, mean, covariance = elsewhere.against(evidence, size, considered)
+        # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
+        odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
+        rival, scale = (odds, mean[arm], covariance[arm, arm]), float(mean[-1])
+    evidence.widen(size)
+    found = [(w, *solved(matrix, vector, evidence.precision(each))) for w, each in near]
+    doubted = [(w, mean[arm], root[arm] @ root[arm].T) for w, mean, root in found]
+    if fitted.held is not None:  # nothing measures the scale
+        doubted = [posterior.with_held(each, *fitted.held) for each in doubted]
+    elif columns.scaled and rival is None:
+        scale = float(found[0][1][-1])
+    return replace(posterior, doubted=tuple(doubted), rival=rival, scale=scale)
+
+
+class _Columns:
+    """Columns of the arm, then of its waves, then of the scale of a device that lengths have.
+
+    With the products of their rows for noise of a size.
+    """
+
+    def __init__(
+        self,
+        fitted: Fitted,
+        noise: float,
+        more: Sequence[str],
+        rounding: Mapping[str, float] | None,
+        waves: float = 0.0,
+    ) -> None:
+        problem, names, system = fitted.problem, fitted.names, fitted.system
+        own = [n for n in more if not (Parameter(n).of_dh or problem.model.owns_frame(n))]
+        self.names, self.chain = (*names, *more), fitted.chain.with_effects(own)
+        beside = {name: std for name, std in (rounding or {}).items() if name in names}
+        whole, lengths, self.scale = self.chain, dict[str, float](), SCALE
+        if more:
+            whole, lengths, self.scale = lengths_of(self.chain, system)
+        doubts = Doubts(beside, lengths, bool(more), Unmodelled(waves=waves), kept=True)
+        noise = max(noise, ROUNDING)  # parameters that follow all exactly leave none
+        self.sums = _sums_of(fitted, whole, self.names, doubts, noise)
+        self.scaled, count = bool(lengths), len(self.sums.plain) - 1
+        self.arm = slice(0, count - self.scaled)  # with waves, in units of their size
+        self.offsets = np.append(fitted.offsets, np.zeros(count - len(names)))
+        self._known: dict[str, float] = {**problem.given} | {**lenses(problem.model)}
+        self._checked = problem.sigma_scale
+        free = {size_group(self.chain, name) for name in names if name not in self._known}
+        self.considered = {size_group(self.chain, name) for name in more} - free
+
+    def evidence(self, scale: float | None = None) -> Evidence:
+        """Return the evidence; with another usual `scale` of the device that nobody checked."""
+        typical = TYPICAL | {'scale': self.scale if scale is None else scale}
+        groups = [None if n in self._known else size_group(self.chain, n) for n in self.names]
+        given = [self._known.get(name, np.inf) for name in self.names]
+        waves = self.arm.stop - len(groups)
+        groups, given = [*groups, *[None] * waves], [*given, *[1.0] * waves]
+        if self.scaled:
+            checked = scale is None and self._checked
+            groups, given = [*groups, None if checked else 'scale'], [*given, checked or np.inf]
+        normal = self.about_nominal(self.sums.reduced)
+        return Evidence(*normal, np.array(given) ** -2.0, groups, typical)
+
+    def about_nominal(self, products: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the normal equations (K, K), (K,) of all offsets from products of their rows."""
+        matrix = products[:-1, :-1]
+        return matrix, matrix @ self.offsets + products[:-1, -1]
 
 
 def _sums_of(
     fitted: Fitted, whole: Chain, every: Sequence[str], doubts: Doubts, noise: float
 ) -> Doubted:
     """Return the products of columns for noise of a size, those of the fit if without doubts."""
-    if doubts.by_device or doubts.sizes:
+    if doubts.by_device or doubts.sizes or doubts.unmodelled.waves:
         return doubted_products(whole, every, fitted.system, doubts, noise)
     products = fitted.products / noise**2
     return Doubted(products, products[:, :0], products[:0, :0])
-
-
-def _evidence_of(
-    chain: Chain,
-    columns: Sequence[str],
-    normal: tuple[FloatArray, FloatArray],
-    known: Mapping[str, float],
-    scale: float,
-) -> Evidence:
-    """Return the evidence of normal equations, with known deviations and the usual `scale`."""
-    own = [n if n == 'scale' else size_group(chain, n) for n in columns]
-    groups = [None if n in known else group for n, group in zip(columns, own, strict=True)]
-    given = np.array([known.get(n, np.inf) for n in columns]) ** -2
-    return Evidence(*normal, given, groups, TYPICAL | {'scale': scale})
-
-
-def _about_nominal(products: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the normal equations (P, P), (P,) of all offsets from the products of their rows."""
-    matrix = products[:-1, :-1]
-    return matrix, matrix @ offsets + products[:-1, -1]
 
 
 def _device(

@@ -32,7 +32,7 @@ from calib_ros.errors import InputError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.considered import considered
-from calib_ros.estimation.evidence import Posterior, posterior_of
+from calib_ros.estimation.evidence import Posterior, posterior_of, with_doubts
 from calib_ros.estimation.fitted import Fitted, ParameterRow, Simpler, parameter_rows
 from calib_ros.estimation.fitting import SOME, fit
 from calib_ros.estimation.leastsquares import System, minimise, normal_equations
@@ -91,7 +91,7 @@ def _identified(
     more = considered(chain, names, problem.fixed)
     posterior = posterior_of(fitted, size, more, doubts)
     unmodelled, moved = unmodelled_errors(posterior, fitted.factor, fitted.system)
-    posterior = replace(posterior, unmodelled=unmodelled)
+    posterior = with_doubts(replace(posterior, unmodelled=unmodelled), fitted, size, more, doubts)
     uncertainty = fitted.uncertainty.with_part(moved).with_part(unmodelled.square)
     parameters = parameter_rows(fitted, structural, uncertainty)
     region, scaled = _region(fitted, posterior, size, more, doubts)
@@ -146,7 +146,8 @@ def _region(
     region = region_of(posterior, sets, freedom)
     if region is None and posterior.scale and not fitted.problem.sigma_scale:
         checked = replace(fitted, problem=replace(fitted.problem, sigma_scale=SCALE))
-        if region_of(posterior_of(checked, size, more, doubts), sets, freedom) is not None:
+        with_checked = with_doubts(posterior, checked, size, more, doubts)
+        if region_of(with_checked, sets, freedom) is not None:
             return None, posterior.scale
     return region, 0.0
 

@@ -144,7 +144,7 @@ def test_a_rival_is_of_the_size_that_the_data_tell(scale):
 
 def told(rng, size=3):
     names = ('base.x', 'elbow_joint.a', 'elbow_joint.theta')[:size]
-    root, other = rng.normal(size=(2, size, size))
+    root = rng.normal(size=(size, size))
     return Posterior(
         UR10E,
         names,
@@ -154,7 +154,6 @@ def told(rng, size=3):
         rng.normal(size=(size, 2)),
         {'elbow_joint.a': 2.0, 'elbow_joint.theta': 0.5},
         {'length': 3e-4, 'angle': 1e-3},
-        ((0.25, rng.normal(size=size), other @ other.T), (0.75, np.zeros(size), np.eye(size))),
     )
 
 
@@ -168,10 +167,15 @@ def test_what_is_held_nominal_is_as_uncertain_as_others_are(rng):
     change = after.covariance - np.pad(before.covariance, (0, 2))
     wanted = along.T @ np.diag([3e-4**2, 1e-3**2]) @ along
     np.testing.assert_allclose(change, wanted, atol=1e-15)
-    for (w, m, c), (weight, mean, covariance) in zip(after.doubted, before.doubted, strict=True):
-        assert w == weight
-        np.testing.assert_array_equal(m, [*mean, 0.0, 0.0])
-        np.testing.assert_allclose(c - np.pad(covariance, (0, 2)), change, atol=1e-12)
+    mean, covariance = np.arange(4.0), np.arange(16.0).reshape(4, 4)  # the last of a wave
+    names = after.names[3:]
+    weight, m, c = after.with_held((0.25, mean, covariance), names, slopes)
+    assert weight == 0.25
+    np.testing.assert_array_equal(m, [0.0, 1.0, 2.0, 0.0, 0.0, 3.0])
+    wave = [0, 1, 2, 5]
+    added = np.pad(change, (0, 1))
+    np.testing.assert_allclose(c[np.ix_(wave, wave)], covariance + added[np.ix_(wave, wave)])
+    np.testing.assert_allclose(c[3:5], added[3:5])
     for whole, part in ((after.offsets, before.offsets), (after.shift, before.shift)):
         np.testing.assert_array_equal(whole, [*part, 0.0, 0.0])
     np.testing.assert_array_equal(after.device, [*before.device, [0.0, 0.0], [0.0, 0.0]])

@@ -11,7 +11,8 @@ from fits import NOISE, SIGMAS, UR10E
 from calib_ros import Calibration, Problem, difference, identify, load_chain, recalibrate
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.errors import ConfigError
-from calib_ros.estimation.joint_errors import NOTHING, moved, moving, waved
+from calib_ros.estimation.considered import Doubts, doubted_products
+from calib_ros.estimation.joint_errors import NOTHING, Unmodelled, moved, moving, waved
 from calib_ros.identification.calibration import parse_calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -22,9 +23,9 @@ WIDTH = 0.6  # rad, either way
 class Wobbling:
     """An arm whose axes wobble by up to 0.3 mrad, measured in regions around postures."""
 
-    def __init__(self, seed):
+    def __init__(self, seed, cell=None):
         self.rng = np.random.default_rng(seed)
-        self.true = faulty(UR10E, Cell(), self.rng)
+        self.true = faulty(UR10E, cell or Cell(), self.rng)
         self.sizes, self.phases = self.rng.uniform(0.0, (3e-4, 6.28), (2, 6, 2)).transpose(2, 0, 1)
 
     def tilts(self, q):
@@ -34,9 +35,12 @@ class Wobbling:
         pairs = zip(('alpha', 'beta'), waves[:, 1:], strict=True)
         return {f'{names[k]}.{kind}': x for kind, own in pairs for k, x in enumerate(own)}
 
+    def poses(self, q):
+        return np.array([self.true.with_offsets(self.tilts(x)).forward(x[None])[0] for x in q])
+
     def measured(self, middle, count, width=WIDTH):
         q = middle + self.rng.uniform(-width, width, (count, 6))
-        poses = np.array([self.true.with_offsets(self.tilts(x)).forward(x[None])[0] for x in q])
+        poses = self.poses(q)
         seen = measure(self.true, q, self.rng)
         noise = self.rng.normal(size=(2, count, 3)) * np.reshape(NOISE, (2, 1, 1))
         turned = se3.exp_rotation(noise[1]) @ poses[:, :3, :3]
@@ -89,6 +93,35 @@ def test_a_few_poses_in_another_region_show_no_change(seed):
     assert again.unmodelled.waves == previous.unmodelled.waves
 
 
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_what_a_sound_arm_wobbles_in_a_small_region_is_corrected_only_there(seed):
+    """Elsewhere the correction would double its errors."""
+    arm = Wobbling(seed, Cell(length_error=0.0, angle_error=0.0))
+    problem = arm.measured(arm.middle(), 60, width=0.4)
+    found = identify(problem)
+    assert found.accepted
+    elsewhere = found.region.covers(UR10E.random_joints(3000, arm.rng))
+    assert elsewhere.mean() < 0.01
+    q = problem.observations.joints
+    assert found.region.covers(q).all()
+    before, after = (chain.forward(q) - arm.poses(q) for chain in (found.before, found.chain))
+    assert np.linalg.norm(after[:, :3, 3]) < 0.7 * np.linalg.norm(before[:, :3, 3])
+
+
+def test_waves_kept_as_parameters_and_then_left_out_are_what_waves_in_doubt_are():
+    problem = Wobbling(0).measured(np.zeros(6), 20)
+    system, names = problem.system(problem.sets), ('base.x', 'elbow_joint.a', 'elbow_joint.beta')
+    doubts = Doubts(lengths={'elbow_joint.a': 0.5}, unmodelled=Unmodelled(waves=1e-4))
+    without = doubted_products(UR10E, names, system, doubts)
+    kept = doubted_products(UR10E, names, system, replace(doubts, kept=True))
+    assert without.doubtful.shape == kept.plain[3:-2, 3:-2].shape == (48, 48)
+    assert kept.doubtful.shape == (0, 0)
+    others = [0, 1, 2, -2, -1]  # the scale and the residual last
+    np.testing.assert_allclose(kept.plain[np.ix_(others, others)], without.plain)
+    np.testing.assert_allclose(kept.plain[others, 3:-2], without.cross)
+    np.testing.assert_allclose(kept.plain[3:-2, 3:-2] + np.eye(48), without.doubtful)
+
+
 def test_expected_errors_contain_it_away_from_the_region():
     """There the parameters that absorbed it are wrong; at the measured poses they are right."""
     squares = []
@@ -101,8 +134,7 @@ def test_expected_errors_contain_it_away_from_the_region():
             middle + arm.rng.uniform(-WIDTH, WIDTH, (200, 6)),
             UR10E.random_joints(1200, arm.rng),  # more than a block
         ):
-            true = [arm.true.with_offsets(arm.tilts(x)).forward(x[None])[0] for x in q]
-            error = (found.chain.forward(q) - np.array(true))[:, :3, 3]
+            error = (found.chain.forward(q) - arm.poses(q))[:, :3, 3]
             squares.append((np.mean((error**2).sum(axis=1)), np.mean(found.sigma(q) ** 2)))
             stated = np.trace(result.pose_covariance(q)[:, :3, :3], axis1=1, axis2=2)
             np.testing.assert_allclose(found.sigma(q) ** 2, stated)
