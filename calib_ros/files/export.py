@@ -45,7 +45,7 @@ from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.kinematics.urdf import corrected_urdf, with_common_normals
 from calib_ros.kinematics.urdf_tree import to_rpy
-from calib_ros.texts import csv_text, dump_yaml, from_cell, to_cell
+from calib_ros.texts import csv_text, dump_yaml, from_cell, parse_yaml, to_cell
 from calib_ros.values import SAME
 
 FILES = (
@@ -94,21 +94,19 @@ def exports(
     lost, of_file_lost = (distance(chain, each, q) for each in controlled)
     counting = ', with the effects of the nominal chain'
     of_table, of_file_too = counting * bool(nominal.effects), counting * bool(others)
-    digest = table_hash(chain)
     found = []
     for convention in get_args(Convention):
-        form = converted(arm, convention)
+        name, form = f'dh_{convention}', converted(arm, convention)
         what = f'{convention} Denavit-Hartenberg table'
         beyond = cut_off(arm, convention)
-        text = _csv(form, f'{what}{of_table}{beyond and f" ({beyond})"}', lost, digest)
-        again = _read_csv(text, form)
-        table = checked(f'dh_{convention}.csv', text, again.forward(q), wanted, lost)
+        text = head(chain, f'{what}{of_table}{beyond and f" ({beyond})"}', lost) + _csv(form)
+        table = checked(f'{name}.csv', text, _read_csv(text, form).forward(q), wanted, lost)
         found.append(replace(table, beyond=beyond))
-        name, form = f'dh_{convention}.yaml', converted(of_file, convention)
-        text = head(form, what + of_file_too, of_file_lost, digest) + dump_chain(form, origin)
-        again = parse_chain(text)
-        found.append(checked(name, text, again.forward(q), of_file.forward(q), of_file_lost))
-    text = head(arm, f'kinematics{of_table}', lost, digest) + kinematics_yaml(arm, origin)
+        text = head(chain, what + of_file_too, of_file_lost)
+        text += dump_chain(converted(of_file, convention), origin)
+        again, exact = parse_chain(text).forward(q), of_file.forward(q)
+        found.append(checked(f'{name}.yaml', text, again, exact, of_file_lost))
+    text = head(chain, f'kinematics{of_table}', lost) + kinematics_yaml(arm, origin)
     found.append(checked('kinematics.yaml', text, forward_of(text, arm, q), wanted, lost))
     region = q if joints is None else np.asarray(joints, dtype=np.float64)
     for name, kinds, what in (
@@ -117,8 +115,8 @@ def exports(
     ):
         best = _approximated(chain, nominal, kinds, region)
         error = distance(best, chain, region)
-        text = _csv(best, f'{nominal.convention} {what}{of_table}', error, digest)
-        found.append(Export(name, text, error))
+        text = head(chain, f'{nominal.convention} {what}{of_table}', error)
+        found.append(Export(name, text + _csv(best), error))
     return tuple(found)
 
 
@@ -195,9 +193,7 @@ def origins(form: Chain) -> FloatArray:
 
 def forward_of(text: str, chain: Chain, q: FloatArray) -> FloatArray:
     """Return the target's poses (N, 4, 4) by a kinematics file, in the frames of a chain."""
-    import yaml
-
-    document = yaml.safe_load(text)
+    document = parse_yaml(text, 'kinematics.yaml')
     poses, signs = document['kinematics'], document['signs']
     places = [pose_matrix(poses[name]) for name in chain.joint_names]
     slides = [joint.type == 'prismatic' for joint in chain.joints]
@@ -238,11 +234,12 @@ def pose_matrix(pose: Mapping[str, float]) -> FloatArray:
     return se3.transform(rotation.as_matrix(), np.array([pose[k] for k in 'xyz']))
 
 
-def head(chain: Chain, what: str, error: float, digest: str) -> str:
-    """Return the first line: a file's kind, its error [m], and its table."""
+def head(chain: Chain, what: str, error: float) -> str:
+    """Return the first line: a file's kind, its error [m], and the table of the chain."""
     name = re.sub(r'[^\w .-]', '_', chain.name)  # one line, one cell
     exact = 'exact' if error == 0.0 else f'up to {1e3 * error:.3f} mm off the calibrated arm'
-    return f'# {name}: {what}; metres and radians; {exact}; calibrated table {digest}\n'
+    table = f'calibrated table {table_hash(chain)}'
+    return f'# {name}: {what}; metres and radians; {exact}; {table}\n'
 
 
 def urdf_export(name: str, urdf: str, chain: Chain, links: Mapping[str, str | None]) -> Export:
@@ -252,10 +249,10 @@ def urdf_export(name: str, urdf: str, chain: Chain, links: Mapping[str, str | No
     return Export(name, corrected_urdf(urdf, chain, **links) + foot, 0.0)
 
 
-def _csv(chain: Chain, what: str, error: float, digest: str) -> str:
+def _csv(chain: Chain) -> str:
     pairs = zip(chain.joints, chain.table.tolist(), strict=True)
     rows = [(to_cell(each.name), each.type, each.sign, *row) for each, row in pairs]
-    return head(chain, what, error, digest) + csv_text([(*ROW, *chain.columns), *rows])
+    return csv_text([(*ROW, *chain.columns), *rows])
 
 
 def _read_csv(text: str, form: Chain) -> Chain:

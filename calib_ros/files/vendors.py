@@ -27,11 +27,10 @@ from calib_ros.errors import ConfigError
 from calib_ros.files import export
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
-from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 from calib_ros.kinematics.urdf_tree import parse_urdf
-from calib_ros.texts import dump_yaml
+from calib_ros.texts import dump_yaml, parse_yaml
 from calib_ros.values import SAME
 
 
@@ -132,7 +131,7 @@ def vendor_files(
         places, reference = layouts[1]
         q = export.anywhere(chain)
         lost = export.distance(chain, arm, q)
-        text = export.head(chain, 'kinematics', lost, table_hash(chain))
+        text = export.head(chain, 'kinematics', lost)
         text += _document(vendor, places, origin, checksum)
         again = forward_of_vendor(text, vendor, q)
         found.append(export.checked(vendor.file, text, again, reference.forward(q), lost))
@@ -141,9 +140,7 @@ def vendor_files(
 
 def forward_of_vendor(text: str, vendor: Vendor, q: FloatArray) -> FloatArray:
     """Return the poses (N, 4, 4) of a file's last frame in the frame of its first joint."""
-    import yaml
-
-    document = yaml.safe_load(text)
+    document = parse_yaml(text, vendor.file)
     poses = document['kinematics'] if vendor is UR else document
     entries = [poses[key] if vendor is UR else poses[key]['kinematic'] for key in vendor.all_keys]
     places = [export.pose_matrix(entry) for entry in entries]
