@@ -89,7 +89,7 @@ class BoardCamera:
         image = image_of(message)
         if isinstance(image, Flaw):
             return image
-        if image.size and all(size) and image.shape != size:
+        if all(size) and image.shape != size:
             sizes = ' and '.join(f'{w} x {h}' for h, w in (image.shape, size))
             reason = f'it and its CameraInfo are of {sizes} px: set both alike'
             return Flaw('of another size than its CameraInfo', reason)
@@ -161,7 +161,7 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def read_image(path: Path) -> Image | Flaw:
-    """Return an image in grey, empty if it is none, or why it cannot be read."""
+    """Return an image in grey, or why it cannot be read."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe may never end
             return Flaw('that cannot be read', 'it is not a file')
@@ -172,8 +172,8 @@ def read_image(path: Path) -> Image | Flaw:
         return Flaw('that cannot be read', f'it cannot be read: {err.strerror}')
 
 
-def decoded(data: NDArray[np.uint8]) -> Image:
-    """Return a compressed image of bytes (B,) in grey (H, W); (0, 0) if it is none.
+def decoded(data: NDArray[np.uint8]) -> Image | Flaw:
+    """Return a compressed image of bytes (B,) in grey (H, W), or that it is none.
 
     EXIF rotation is ignored, because the lens is that of the sensor image. Of 10 to 16 bits the
     eight highest used ones are kept.
@@ -185,7 +185,7 @@ def decoded(data: NDArray[np.uint8]) -> Image:
     except cv2.error:
         image = None
     if image is None or image.dtype not in (np.uint8, np.uint16):
-        return np.zeros((0, 0), dtype=np.uint8)
+        return Flaw('that cannot be decoded', 'OpenCV cannot read this image')
     if image.dtype == np.uint16:
         image = image >> max(int(image.max()).bit_length() - 8, 0)
     return np.asarray(image, dtype=np.uint8)

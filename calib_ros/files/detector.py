@@ -116,8 +116,6 @@ class Detector:
 
     def of(self, image: Image) -> Corners | Flaw:
         """Return numbers (K,) and pixels (K, 2) of the corners, or why the image is not used."""
-        if not image.size:
-            return Flaw('that cannot be decoded', 'OpenCV cannot read this image')
         width = _edge_width(self._cv2, image)
         if width > 8.0:
             return Flaw('blurred', f'it is blurred: its sharpest edges are {width:.0f} px wide')
