@@ -139,12 +139,11 @@ class Columns:
         return place[numbers], names
 
     def blank(self, name: str) -> Flags:
-        """Return (N,) which cells of a column are empty."""
-        given = self.cells[name]
+        """Return (N,) which cells of a column are empty; all without the column."""
+        given = self.cells.get(name)
         if not isinstance(given, str):
-            return np.isnan(given)
-        cells = f'{BETWEEN}{given.lower()}{BETWEEN}'
-        if not MAYBE_MISSING.search(cells):
+            return np.ones(len(self.lines), bool) if given is None else np.isnan(given)
+        if not MAYBE_MISSING.search(f'{BETWEEN}{given.lower()}{BETWEEN}'):
             return np.zeros(len(self.lines), dtype=bool)
         return np.array([text.strip().lower() in MISSING for text in self.texts(name)], dtype=bool)
 

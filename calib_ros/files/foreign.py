@@ -192,7 +192,7 @@ class _Table:
             if (rate and bare != name) or (other and unit not in (*UNIT_SIGNS, *SECONDS)):
                 continue  # the axes of KUKA are A1, A2, ...: no accelerations
             number = f'#{column + 1}'
-            if ours == 'time' and not self._has_number(number):  # but a date
+            if ours == 'time' and math.isinf(self._first(number)):  # a date
                 continue
             kept[ours] = Expression.parse(number)
             if name != ours:
@@ -237,10 +237,10 @@ class _Table:
                 f'{self.path} has no column for {", ".join(missing)}; {self.has}. {advice}'
             )
 
-    def _has_number(self, number: str) -> bool:
-        """Tell whether the first cell of a column is a number or blank."""
+    def _first(self, number: str) -> float:
+        """Return the number in the first cell of a column, as `cell_number`."""
         sheet = self._sheet.columns
-        return not math.isinf(cell_number(next(iter(sheet.texts(number)), ''), sheet.decimal))
+        return cell_number(next(iter(sheet.texts(number)), ''), sheet.decimal)
 
     def unread(self) -> list[str]:
         """Return the names of the columns that nothing is made of."""
@@ -254,9 +254,9 @@ class _Table:
         """
         theirs = {name.lower() for name in other._sheet.header}
         for k, name in enumerate(self._sheet.header, start=1):
-            cells = self._sheet.columns.texts(f'#{k}')
-            number = math.isfinite(cell_number(next(iter(cells), ''), self._sheet.columns.decimal))
+            number = math.isfinite(self._first(f'#{k}'))
             if name and (not number or name.lower() in theirs):
+                cells = self._sheet.columns.texts(f'#{k}')
                 same = (LEADING_ZEROS.sub('', cell.lower()).removesuffix('.0') for cell in cells)
                 yield name.lower() if number else '', name, [*same]
 

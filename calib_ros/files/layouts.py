@@ -62,17 +62,13 @@ class Expression:
     def parse(cls, text: str) -> Expression:
         """Parse an expression."""
         terms: list[str | float] = []
-        code, at = '', 0
-        while at < len(text):
-            match = TOKEN.match(text, at)
-            if match is None or len(text) > LONGEST_NAME:
-                raise ConfigError(UNREADABLE.format(text))
-            braced, column, number, plain, sign = match.groups()
+        code, tokens = '', [*TOKEN.finditer(text[:LONGEST_NAME])]
+        if ''.join(each[0] for each in tokens) != text:
+            raise ConfigError(UNREADABLE.format(text))
+        for braced, column, number, plain, sign in (each.groups() for each in tokens):
             if not sign:
-                name = braced or plain or f'#{column}'
-                terms.append(float(number) if number else name)
+                terms.append(float(number) if number else braced or plain or f'#{column}')
             code += sign or f' _{len(terms) - 1} '
-            at = match.end()
         try:
             found = cls(text, tuple(terms), ast.parse(code.strip(), mode='eval').body)
             found.of(dict.fromkeys(found.names, np.ones(1)))
@@ -167,16 +163,11 @@ class Layout:
         return SEPARATORS.get(self.separator, self.separator)
 
 
-def presets() -> dict[str, Path]:
-    """Return the supplied layouts by name."""
-    return shared_files('tables')
-
-
 def load_layout(name_or_path: str) -> Layout:
     """Return a preset, or the layout in a YAML file."""
     path = Path(name_or_path)
     if path.suffix not in ('.yaml', '.yml'):
-        shipped = presets()
+        shipped = shared_files('tables')
         if name_or_path not in shipped:
             raise UnknownNameError('preset (or path of a .yaml)', name_or_path, sorted(shipped))
         path = shipped[name_or_path]
@@ -209,12 +200,7 @@ def parse_columns(text: str) -> Iterator[tuple[str, str]]:
 
 def _in_their_names(text: str, known: Mapping[str, str]) -> str:
     """Return an expression with our columns that are `known` written in theirs."""
-
-    def written(match: re.Match[str]) -> str:
-        theirs = known.get(match[4] or '')
-        return match[0] if theirs is None else f'({theirs})'
-
-    return TOKEN.sub(written, text)
+    return TOKEN.sub(lambda m: f'({known[m[4]]})' if m[4] in known else m[0], text)
 
 
 def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> Layout:

@@ -203,8 +203,7 @@ def measurements(columns: Columns, joints: int) -> Measurements:
     """Return the measurements in a table; refuse invalid rows."""
     header = columns.header
     _check_header(columns, joints)
-    has = [~columns.blank(n) if n in header else np.zeros(len(columns.lines), bool) for n in KINDS]
-    filled = np.array(has)
+    filled = np.array([~columns.blank(name) for name in KINDS])
     for row in np.flatnonzero(filled.sum(axis=0, dtype=np.uint8) > 1)[:1].tolist():
         kinds = ' and '.join(np.array(KINDS)[filled[:, row]])
         raise InputError(
@@ -298,7 +297,7 @@ def _choices(
 
 def _stamps(columns: Columns) -> NDArray[np.int64]:
     lines = columns.lines.astype(np.int64) * 1_000_000_000
-    if 'stamp_ns' not in columns.header or columns.blank('stamp_ns').all():
+    if columns.blank('stamp_ns').all():
         return lines
     try:
         return columns.integers('stamp_ns', lines)

@@ -124,13 +124,10 @@ def _of_text(path: Path, layout: Layout) -> _Content:
             f'{path} separates its cells by {guessed}s: give --separator {guessed}'
             + ', or to --joints-preset a layout of your own' * bool(layout.source)
         )
-    return _Content(_rows_of_text(path, narrow, separator), notes, comments=comments)
-
-
-def _rows_of_text(path: Path, text: str, separator: str) -> Iterator[list[Cells]]:
-    for block in csv_blocks(path, text.encode(), separator):
-        rows = [(line, [*map(str.strip, cells)]) for line, cells in block]
-        yield [(line, cells) for line, cells in rows if any(cells)]
+    blocks = csv_blocks(path, narrow.encode(), separator)
+    bare = ([(line, [*map(str.strip, cells)]) for line, cells in block] for block in blocks)
+    rows = ([row for row in block if any(row[1])] for block in bare)
+    return _Content(rows, notes, comments=comments)
 
 
 def _sheet(

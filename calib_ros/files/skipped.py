@@ -61,9 +61,7 @@ def without_statistics(columns: Columns) -> tuple[Columns, tuple[str, ...]]:
     """Return the rows that are not called mean, max and the like at the end, and a note."""
     named = set[int]()  # rows from the end
     for given in columns.cells.values():
-        if not isinstance(given, str):
-            continue
-        last = given[-10 * LONGEST :].lower().split(BETWEEN)  # of many rows
+        last = str(given)[-10 * LONGEST :].lower().split(BETWEEN)  # as read: text of many rows
         for row, cell in enumerate(reversed(last), start=1):
             if STATISTIC.fullmatch(cell.strip()) and last.count(cell) == 1:
                 named.add(row)

@@ -2,12 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of samples (CSV): measurements or a journal (docs/formats.md).
 
-Joint values are in q1 ... qn. The filled cells of a row determine what was measured: a pose (x y z
-and qx qy qz qw), a position (x y z), a distance to a fixed point (distance), a ball in a socket
-(location, socket) or a touched plane (plane). The pose of a board may include its corners (view):
-the lens, fx fy cx cy k1 k2 p1 p2 k3 and whether it is fixed (1 or 0), then x y z u v of each
-corner, joined by semicolons.
-
 A table is read as a CSV with these names (`columns`), a journal, or one of another system
 (`foreign`); its rows become measurements with their rules, then sets of observations.
 """

@@ -10,8 +10,9 @@ from calib_ros import Chain, Settings, read_table
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import Expression, Layout, layout_of, load_layout, presets
+from calib_ros.files.layouts import Expression, Layout, layout_of, load_layout
 from calib_ros.kinematics.chain import Joint
+from calib_ros.kinematics.chain_file import shared_files
 
 
 def test_later_columns_may_use_our_names_of_earlier_ones():
@@ -39,8 +40,8 @@ def test_another_way_to_turn_replaces_that_of_a_preset():
 
 
 def test_every_preset_says_where_its_format_is_documented():
-    assert len(presets()) >= 11
-    for name in presets():
+    assert len(shared_files('tables')) >= 11
+    for name in shared_files('tables'):
         layout = load_layout(name)
         assert layout.description
         assert layout.source
