@@ -66,10 +66,9 @@ def replay(path: Path | str, session: CalibrationSession, progress: Notify = qui
     of the session name topics if the types are ambiguous; `progress` receives the share read.
     """
     path = Path(path)
-    if not (path.is_dir() or path.is_file()):
-        raise InputError(f'there is no bag at {path}: give its folder or one of its files')
-    session.pictures.cameras, session.pictures.patient = cameras_of(session.settings.sources), True
     with unpacked_files(path) as folder:
+        session.pictures.cameras = cameras_of(session.settings.sources)
+        session.pictures.patient = True
         return _replay(path, folder, session, progress)
 
 
@@ -141,8 +140,6 @@ def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
 
     sensor_msgs/Image and CompressedImage; one that cannot be decoded raises InputError.
     """
-    if not path.exists():
-        raise InputError(f'there is no bag at {path}')
     deserialise = _deserialiser({})
     with unpacked_files(path) as folder, closing(_opened(path, folder)) as reader:
         found = {c.topic: c for c in reader.connections if c.msgtype in PICTURES}

@@ -30,6 +30,8 @@ def recorded_files(path: Path, kinds: Sequence[str] = UNPACKED) -> tuple[Path, .
 @contextmanager
 def unpacked_files(path: Path) -> Iterator[Path]:
     """Provide a bag whose files are neither compressed nor partly in a write-ahead log."""
+    if not (path.is_dir() or path.is_file()):
+        raise InputError(f'there is no bag at {path}: give its folder or one of its files')
     files = recorded_files(path, RECORDED)
     if not any(file.suffix == '.zstd' or _log(file).is_file() for file in files):
         yield path
