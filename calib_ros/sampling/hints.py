@@ -171,24 +171,18 @@ def _scattered(samples: Sequence[Sample]) -> list[Hint]:
         and each.position is not None
         and each.spread > 1e-3 * np.abs(each.position).max()
     ]
-    if len(far) < START or len(far) <= EXCEPTION * len(samples):
+    return of_two_places(far, EXCEPTION * len(samples))
+
+
+def of_two_places(spreads: Sequence[float], usual: float) -> list[Hint]:
+    """Report stops in two places, if more than is usual, with their spreads [m]."""
+    if len(spreads) < START or len(spreads) <= usual:
         return []
-    return [_of_two_places(far)]
-
-
-def alternating(spreads: Sequence[float], stops: int) -> list[Hint]:
-    """Report most stops in two places by turns, with their spreads [m]."""
-    many = len(spreads) >= START and len(spreads) > 0.5 * stops
-    return [_of_two_places(spreads)] if many else []
-
-
-def _of_two_places(spreads: Sequence[float]) -> Hint:
     size = float(f'{1e3 * np.median(spreads):.2g}')
     words = f'measurements at {len(spreads)} stops scatter by {size:g} mm'
     words += ': do two devices or targets publish on a topic?'
-    return Hint(
-        words, f'{words} Give each its own source, and measure again (node: ~/clear first)'
-    )
+    remedy = 'Give each its own source, and measure again (node: ~/clear first)'
+    return [Hint(words, f'{words} {remedy}')]
 
 
 def losses(received: Mapping[str, int], dropped: Mapping[str, int]) -> list[Hint]:

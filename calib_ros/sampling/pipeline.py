@@ -12,7 +12,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.clocks import Clocks
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.gate import Gate
-from calib_ros.sampling.hints import Hint, alternating, unmeasured, unsettled
+from calib_ros.sampling.hints import Hint, of_two_places, unmeasured, unsettled
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice
 from calib_ros.sampling.stops import MOVING
@@ -69,7 +69,7 @@ class Pipeline:
     def unsettled(self) -> list[Hint]:
         """Return what looks wrong with measurements at stops, if no stamps explain it."""
         sampler, missed = self.collector.sampler, self.collector.unmeasured
-        found = alternating(sampler.doubled, sampler.rested)
+        found = of_two_places(sampler.doubled, 0.5 * sampler.rested)  # most of them, by turns
         found += unsettled(sampler.restless, sampler.restless + sampler.rested)
         between = 0 if sampler.rested else self.collector.unused[f'{POSES}: {MOVING}']
         return found + (unmeasured(missed, between) if sampler.rested or between else [])
