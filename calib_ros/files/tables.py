@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of samples (CSV): measurements or a journal (docs/formats.md).
 
-A table is read as a CSV with these names (`columns`), a journal, or one of another system
+A table is read as a CSV with our names (`vocabulary`), a journal, or one of another system
 (`foreign`); its rows become measurements with their rules, then sets of observations.
 """
 
