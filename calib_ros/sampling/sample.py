@@ -134,8 +134,7 @@ def socket_pairs(samples: Iterable[Sample], frames: Frames) -> list[tuple[str, s
         if sample.socket:
             location = sample.session, sample.device.rpartition('_')[0]
             ends.setdefault(location, {})[frames.of(sample)[0]] = None
-    pairs = [tuple(each) for each in ends.values() if len(each) == 2]
-    return [(pair[0], pair[1]) for pair in pairs]
+    return [(one, other) for one, other in (each for each in ends.values() if len(each) == 2)]
 
 
 def plain(name: str) -> str:

@@ -131,7 +131,7 @@ class CalibrationSession:
         self._settle(wait=True)
         taken = len(self.samples) - before
         why = self.state if JOINTS in self._filter.refused else why
-        return (taken, why) if taken or not count else (0, self.pictures.refused)
+        return taken, why if taken or not count else self.pictures.refused
 
     def remove_last(self) -> Sample:
         """Remove the last sample."""

@@ -349,14 +349,17 @@ def test_a_delay_left_open_that_may_be_none_is_not_told_of_stops():
 
 
 @pytest.mark.parametrize(
-    ('mode', 'late', 'said'),
+    ('mode', 'seconds', 'late', 'said'),
     [
-        ('dwell', 0.3, r'-1\.10 or -0\.40 or 0\.30 or 1\.00'),
-        ('continuous', 0.0, r'-0\.70 or 0\.00 or 0\.70'),
+        ('dwell', 20.0, 0.3, r'-1\.10 or -0\.40 or 0\.30 or 1\.00'),
+        ('continuous', 20.0, 0.0, r'-0\.70 or 0\.00 or 0\.70'),
+        ('continuous', 10.0, 0.0, r'-0\.70 or 0\.00 or 0\.70'),  # before clocks are looked at
     ],
 )
-def test_a_delay_that_periodic_motion_leaves_open_is_told_and_not_applied(mode, late, said):
-    made = heard(back_and_forth, 20.0, mode=mode, late=lambda times: late)
+def test_a_delay_that_periodic_motion_leaves_open_is_told_and_not_applied(
+    mode, seconds, late, said
+):
+    made = heard(back_and_forth, seconds, mode=mode, late=lambda times: late)
     (warning,) = told(made)
     assert re.search(rf'is ambiguous \({said} s\) because the motion repeats itself', warning)
     made.finish()
