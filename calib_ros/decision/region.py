@@ -204,8 +204,7 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     if not max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts)) < RISK:
         return None
     shells = order[~inside]
-    for first in range(0, len(shells), SHELL):
-        shell = shells[first : first + SHELL]
+    for shell in np.split(shells, range(SHELL, len(shells), SHELL)):
         added = judge.products(rows[..., shell])
         if not judge.risk(added, inner + added, doubts) < RISK:
             break

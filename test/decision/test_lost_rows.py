@@ -31,7 +31,7 @@ def seen_of(count, oriented):
     [
         ([9], [-1], 'from line 11 on the joint values stand 1 row below'),
         ([-2, -1], [21, 22], 'from line 22 on the joint values stand 2 rows above'),
-        ([31], [0], 'before line 33 the joint values stand 1 row above'),
+        ([35, 36], [0, 1], 'before line 38 the joint values stand 2 rows above'),
     ],
 )
 @pytest.mark.parametrize('oriented', [True, False])
