@@ -211,11 +211,11 @@ class LiveEstimate:
         rows = np.column_stack([np.diag(inverse), residual])
         self._chain, self._products, self._rows = chain, rows.T @ rows, 0
         added, self._added = self._added, []
-        self._add(added, gate=False)
+        self._add(added)
 
-    def _add(self, samples: Sequence[Sample], gate: bool = True) -> None:
+    def _add(self, samples: Sequence[Sample]) -> None:
         assert self._chain is not None
-        if gate and self._enough(self._rows):
+        if self._enough(self._rows):
             samples = self._plausible(samples)
         system = self._system(self._groups(samples))
         self._products = self._products + products_of(self._chain, self._names, system)[0].sum(0)

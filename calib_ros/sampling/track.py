@@ -54,7 +54,7 @@ class Track:
     def newest_ns(self) -> int:
         """Return the stamp up to which all named joints have been received."""
         newest = self._newest()
-        return int(newest[newest > 0].min(initial=np.iinfo(np.int64).max)) if newest.any() else 0
+        return int(newest[newest > 0].min()) if newest.any() else 0
 
     def _newest(self) -> Stamps:
         """Return the newest stamp of each joint (n,), zero if never named."""

@@ -48,7 +48,10 @@ def test_the_last_name_of_the_topic_tells_what_judges_unless_it_is_said(text, ju
         (['/x type=Pose'], 'unknown type of source "/x"'),
         (['/x eye_in_hand=', '/x eye_in_hand=1', '/x validation=True'], 'must be true or false'),
         (['/x device=a.b', '/x device=a,b', '/x target=a.b'], r'without \. and ,'),
-        (['/tf parent=tool child=/tool', '/x type=TFMessage'], 'needs parent=FRAME child=FRAME'),
+        (
+            ['/tf', '/tf parent=tool child=/tool', '/x type=TFMessage'],
+            'needs parent=FRAME child=FRAME',
+        ),
         (['/x type=PoseStamped parent=a child=b'], 'needs parent=FRAME child=FRAME'),
         (['/x type=RigidBodies', '/x type=NamedPoseArray child=a'], 'NamedPoseArray, and only t'),
     ],
@@ -67,12 +70,12 @@ def test_the_standard_sources_can_be_written_down():
 
 def test_a_topic_is_named_once_or_once_for_each_pair_of_frames():
     assert parse_sources(['/a', '/b']) == (Source('/a'), Source('/b'))
-    pairs = ['/tf parent=world child=a', '/tf parent=world child=b']
-    assert parse_sources(pairs)[0] == Source('/tf', TRANSFORMS, parent='world', child='a')
+    pairs = ['/bodies parent=world child=a', '/bodies parent=world child=b']
+    assert parse_sources(pairs)[0] == Source('/bodies', TRANSFORMS, parent='world', child='a')
     bodies = [f'/x parent=w child=a type={kind}' for kind in ('RigidBodies', 'NamedPoseArray')]
     for texts, said in (
         (['/a', '/b', '/a device=left'], '"/a" is named twice'),
-        ([*pairs, pairs[0]], '"/tf world a" is named twice'),
+        ([*pairs, pairs[0]], '"/bodies world a" is named twice'),
         ([bodies[0], bodies[1].replace('=a', '=b')], '"/x" is named with different types'),
     ):
         with pytest.raises(ConfigError, match=said):

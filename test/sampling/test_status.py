@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fits import NOISE
+from recorded import pose_with_covariance
 from sessions import SIGMAS, TRUE, UR5E, drive, samples, session, tracker
 from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, take
 
@@ -254,6 +255,13 @@ def test_the_status_tells_why_no_measurement_is_used():
     assert 'measurements are refused, NaN or infinite position' in made.status()
     take(made, (TRACKER, POSE, pose(10**18, np.zeros(3), np.eye(3))))
     assert 'refused' not in made.status()
+    kind = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+    skew = np.eye(6) + np.eye(6, k=1)
+    come = enumerate([np.eye(6), skew, skew, -np.eye(6)])  # a device repeats its last one
+    take(made, *((TRACKER, kind, pose_with_covariance(10**18 + k, each)) for k, each in come))
+    dropped, unknown = made.account().dropped, '(leave it zero if it is not known)'
+    for fault, count in (('not symmetric', 2), ('not positive definite', 1)):
+        assert dropped[f'measurements: covariance {fault} {unknown}'] == count
 
 
 def test_poses_that_do_not_follow_the_arm_are_told():
