@@ -157,6 +157,14 @@ def told(rng, size=3):
     )
 
 
+def test_what_is_not_measured_is_as_uncertain_as_the_tails_of_the_prior():
+    """Student's t with three degrees of freedom has three times the variance of a normal one."""
+    usual = Evidence(np.zeros((1, 1)), np.zeros(1), np.zeros(1), ['angle'], {'angle': 1e-3})
+    size = np.log([2e-3])
+    usual.widen(size)
+    assert usual.precision(size) ** -0.5 == pytest.approx(3.0**0.5 * 2e-3, rel=0.01)
+
+
 def test_what_is_held_nominal_is_as_uncertain_as_others_are(rng):
     """The fitted parameters, before considered ones, follow; of usual size if no size is known."""
     before, slopes = told(rng), np.array([[0.5, 1.0], [-2.0, 0.0]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fits import NOISE, SIGMAS, UR10E, fitted
 
-from calib_ros import Observations, Problem, identify
+from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.comparison import residuals
 from calib_ros.errors import InputError
@@ -219,6 +219,8 @@ def test_distances_that_no_arm_moves_by_are_no_metres(rng, unit):
     typo = seen.distances.copy()
     typo[::6] *= unit
     Problem(UR10E, replace(seen, distances=typo), **SIGMAS)  # gross errors are for the fit
+    straight = load_chain('kuka_iiwa14')  # all of its lengths are along its axes
+    Problem(straight, wire(straight, 60, rng), **SIGMAS)
 
 
 def test_joint_values_in_degrees_are_told_beside_distances(rng):
