@@ -52,6 +52,8 @@ def test_noise_makes_no_gauge_freedom_look_determined():
         for place in range(4):  # which is fitted to its own pairs, so that they err about nothing
             away = side.position[side.configurations == place].mean(axis=0)
             assert np.abs(away).max() < 1e-3 * 5e-4
+    errors = np.linalg.norm(result.validation.after.position, axis=1)
+    assert np.sqrt(np.mean(errors**2)) > 3.0**0.5 * 5e-4  # of places left out
 
 
 @pytest.mark.parametrize('offset', [0.0, 3e-4])

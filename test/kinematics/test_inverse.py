@@ -9,7 +9,7 @@ from commanded import twist
 from calib_ros.apply import simulation
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, shipped_robots
-from calib_ros.kinematics.inverse import limits, solve
+from calib_ros.kinematics.inverse import a_turn_away, limits, solve
 from calib_ros.values import SAME
 
 
@@ -32,6 +32,12 @@ def test_poses_are_reached_from_nearby(robot, rng):
     if len(chain.joints) < 7:
         near = np.abs(found.joints - q).max(axis=1)[found.converged]
         assert np.mean(near < 1e-4) > 0.9
+
+
+def test_a_rail_is_not_turned():
+    joint = replace(load_chain('ur10e').joints[0], lower=-1.0, upper=1.0)
+    assert a_turn_away(joint, 7.0) == '; a full turn away, 0.716815 is within them: give that'
+    assert a_turn_away(replace(joint, type='prismatic'), 7.0) == ''
 
 
 def test_non_geometric_effects_are_taken_into_account(rng):
