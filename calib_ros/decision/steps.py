@@ -289,7 +289,7 @@ class _Scan:
         return np.asarray(np.cumsum(found[::-1], axis=0)[::-1])
 
     def few_gross(self, found: _Found) -> bool:
-        """Tell whether stops on the shorter side are gross errors, too few for a step.
+        """Tell whether gross errors on the shorter side are too few to be a step themselves.
 
         The freedoms of a frame explain one or two positions whatever their errors.
         """
@@ -298,7 +298,7 @@ class _Scan:
         numbers = np.concatenate([self._numbers[k] for k in sets])
         gross, every = np.setdiff1d(numbers, numbers[kept]), np.unique(numbers)
         after = 2 * np.count_nonzero(every >= found.stop) < len(every)
-        return 0 < int(np.count_nonzero((gross >= found.stop) == after)) < LEAST_ASIDE
+        return bool(np.count_nonzero((gross >= found.stop) == after) < LEAST_ASIDE)
 
     def drifts(self, found: _Found) -> bool:
         """Tell whether a slow drift of the same group explains more than the step."""
