@@ -61,7 +61,7 @@ class LinearModel:
         self._system = problem.system(sets)
         numbers = numbered(sets)
         self._groups = np.concatenate(numbers)
-        blocks = np.full(int(self._groups.max(initial=-1)) + 1, -1)
+        blocks = np.full(int(self._groups.max()) + 1, -1)
         for each in numbers:  # every fold gets some of each set
             new = np.unique(each[blocks[each] < 0])
             blocks[new] = np.arange(len(new)) * problem.folds // len(new)

@@ -290,7 +290,7 @@ def test_a_large_error_of_the_nominal_chain_itself_was_judged_when_it_was_identi
     elbow = nominal.joint_names.index('elbow_joint')
     joints = list(nominal.joints)
     joints[elbow] = replace(joints[elbow], sign=-1)
-    with pytest.raises(ConfigError, match='the sign of elbow_joint'):
+    with pytest.raises(ConfigError, match='the sign of elbow_joint is 1, not -1'):
         parse_calibration(far, 'c.yaml', replace(nominal, joints=tuple(joints)))
 
 
