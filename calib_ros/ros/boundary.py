@@ -95,6 +95,7 @@ class InOrder(Waitable):  # type: ignore[misc]  # see pyproject.toml
 
     def __init__(self, node: Node) -> None:
         super().__init__(node.default_callback_group)
+        self._logger = node.get_logger()
         self._services: list[Service] = list(node.services)
         self._places: list[int] = []  # in the wait set
         self._waited = ExitStack()
@@ -140,10 +141,17 @@ class InOrder(Waitable):  # type: ignore[misc]  # see pyproject.toml
         return sorted(come, key=itemgetter(0))
 
     async def execute(self, taken_data: list[tuple[int, Service, Any, Any]]) -> None:
-        """Answer calls."""
+        """Answer calls; the answer of one that fails is blank."""
         for _, service, request, header in taken_data:
-            response = service.callback(request, service.srv_type.Response())
-            service.send_response(response, header)
+            response = service.srv_type.Response()
+            try:
+                try:
+                    response = service.callback(request, response)
+                finally:
+                    service.send_response(response, header)
+            except Exception as err:  # as of rclpy, for a parameter of no known type
+                name = service.srv_name
+                self._logger.error(f'{name}: the call cannot be answered: {err!r}')
 
 
 class DeferredTrigger:

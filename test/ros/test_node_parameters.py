@@ -10,6 +10,7 @@ import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from launching import parameters_of
+from rcl_interfaces import msg, srv
 from rclpy.exceptions import ParameterException
 from rclpy.parameter import Parameter
 from ros_cell import Cell, Child, topics
@@ -71,6 +72,27 @@ def test_a_setting_that_cannot_be_is_refused_and_changes_nothing(idle, name, val
     assert said in result.reason
     assert declared(idle.node) == before
     assert idle.node.session.settings == settings
+
+
+@pytest.mark.parametrize(
+    ('kind', 'name'),
+    [
+        (srv.SetParameters, 'set_parameters'),
+        (srv.SetParametersAtomically, 'set_parameters_atomically'),
+    ],
+)
+def test_a_parameter_of_a_type_that_there_is_not_does_not_end_the_node(idle, kind, name):
+    """An exception of rclpy in the parameter service ended the spinning."""
+    told = idle.log()
+    broken = msg.Parameter(name='folds', value=msg.ParameterValue(type=200))
+    client = idle.peer.create_client(kind, f'calibration_node/{name}')
+    idle.spin_until(client.service_is_ready)
+    answer = client.call_async(kind.Request(parameters=[broken]))
+    idle.spin_until(answer.done)
+    assert answer.result() == kind.Response()
+    said = f"calibration_node/{name}: the call cannot be answered: ValueError('200 is not"
+    idle.spin_until(lambda: any(said in each.msg for each in told))
+    assert all(each.successful for each in idle.set_parameters({'folds': Settings.folds}))
 
 
 def test_settings_change_at_run_time(cell, recording):
