@@ -184,6 +184,11 @@ class DeferredTrigger:
         self._send = self._service.send_response
         self._service.send_response = self._send_unless_deferred
 
+    @property
+    def busy(self) -> bool:
+        """Tell whether work runs."""
+        return self._running.is_set()
+
     def join(self, timeout: float) -> bool:
         """Wait for the work [s]; return whether it has ended."""
         if self._thread is not None:
@@ -192,7 +197,7 @@ class DeferredTrigger:
 
     def _on_call(self, request: Any, response: Any) -> Any:
         def prepare() -> Answer:
-            if self._running.is_set():
+            if self.busy:
                 return False, 'refused: the previous call is still running; wait for its answer'
             self._snapshot = [self._prepare()]
             return True, ''

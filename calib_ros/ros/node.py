@@ -30,7 +30,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from calib_ros.atomic import given_path
 from calib_ros.decision.comparison import compare
-from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.errors import CalibrationError, ConfigError, InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
@@ -124,28 +124,28 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             self.create_timer(period, self._boundary.guarded(work), clock=steady)
         self._load_at_start()
 
-    def _serve(self) -> list[DeferredTrigger]:
+    def _serve(self) -> dict[str, DeferredTrigger]:
         for kind, name, callback in (
             (Trigger, '~/cancel', lambda request: self._identifying.progress.cancel()),
             (Trigger, '~/capture', self._on_capture),
             (Trigger, '~/remove_last', self._on_remove_last),
             (Trigger, '~/clear', self._on_clear),
-            (Trigger, '~/load', self._on_load),
+            (Trigger, '~/load', partial(self._settled, self._on_load)),
             (SetBool, '~/record', self._on_record),
         ):
             self.create_service(kind, name, self._answering(name, callback))
         identify = self._identifying
         slow: tuple[tuple[str, Callable[[], Any], Callable[[Any], Answer]], ...] = (
             ('~/identify', lambda: identify.snapshot(self._inputs), identify.run),
-            ('~/export', self._keeper.exportable, self._keeper.export),
-            ('~/save', self._keeper.to_save, self._on_save),
+            ('~/export', partial(self._settled, self._keeper.exportable), self._keeper.export),
+            ('~/save', partial(self._settled, self._keeper.to_save), self._on_save),
             ('~/check', self.session.recent, self._on_check),
             ('~/validate', self._to_judge, self._on_validate),
         )
-        return [
-            DeferredTrigger(self, name, self._answer, partial(self._up_to_now, begin), work)
+        return {
+            name: DeferredTrigger(self, name, self._answer, partial(self._up_to_now, begin), work)
             for name, begin, work in slow
-        ]
+        }
 
     def announce(self) -> None:
         """Log that the node is ready, once an executor serves it."""
@@ -156,7 +156,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     def close(self) -> bool:
         """Stop; return False if an identification still runs and must not be waited for."""
-        ended = [each.join(JOIN_TIMEOUT) for each in self._working]
+        ended = [each.join(JOIN_TIMEOUT) for each in self._working.values()]
         ended.append(self._guide.join(JOIN_TIMEOUT))
         self._take_messages()
         self.session.finish()
@@ -277,6 +277,14 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     def _up_to_now(self, begin: Callable[..., Any], *arguments: Any) -> Any:
         self._take_messages()
+        return begin(*arguments)
+
+    def _settled(self, begin: Callable[..., Any], *arguments: Any) -> Any:
+        if self._working['~/identify'].busy:
+            raise InputError(
+                'refused: an identification is running, and may replace the calibration in use: '
+                'wait for its answer, or call ~/cancel'
+            )
         return begin(*arguments)
 
     def _on_capture(self, request: Any) -> Answer:
