@@ -93,6 +93,8 @@ class Archive:
                 del self._waiting[0]
         except OSError as err:
             self.error = trouble(OSError(err.errno, err.strerror))  # without the path: known
+        except InputError as err:  # another process writes it
+            self.error = str(err)
         else:
             self.error = ''
 
@@ -165,7 +167,7 @@ class Archive:
         path = self._path.with_suffix(f'.identified{ending}').absolute()
         try:
             write_file(path, text, overwrite=True)
-        except OSError:
+        except (OSError, InputError):
             return None
         return path
 

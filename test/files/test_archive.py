@@ -251,6 +251,35 @@ def test_a_folder_in_which_nothing_can_be_written_is_refused(folder):
     assert '\n' not in str(caught.value)
 
 
+def test_poses_of_two_nodes_that_would_write_one_journal_are_kept(tmp_path, monkeypatch):
+    """After the clock was set back both chose the name behind the newest: poses were lost."""
+    folder, elsewhere = tmp_path / 'data', tmp_path / 'tmp'
+    elsewhere.mkdir()
+    open_archive(folder)
+    (folder / 'arm_20990101T000000000000Z.csv').touch()
+    first, second = open_archive(folder), open_archive(folder)
+    for archive in (first, second):
+        archive.add(sample(1))
+        archive.add(sample(2))
+    assert not first.error
+    assert second.error.startswith(f'another process writes {first.journal}: give each robot')
+    with pytest.raises(InputError, match='in memory only and would be lost'):
+        second.start_new()
+    monkeypatch.setattr(tempfile, 'tempdir', str(elsewhere))
+    words = second.close()
+    (journal,) = elsewhere.glob('*/*.csv')
+    assert f'poses are in {journal}, not in {folder}: another process' in words
+    assert stamps(journal.parent) == stamps(folder) == [1, 2]
+
+
+def test_a_note_that_cannot_be_written_is_none(tmp_path):
+    """It left ~/identify without an answer, and the next call refused as still running."""
+    archive = open_archive(tmp_path)
+    archive.add(sample(1))
+    archive.journal.with_suffix('.identified.txt').mkdir()
+    assert archive.note('text') is None
+
+
 @pytest.mark.parametrize('how', ['deleted', 'folder deleted', 'replaced'])
 def test_a_journal_that_is_not_there_any_more_goes_on_in_another_file(tmp_path, how):
     folder = tmp_path / 'data'
