@@ -82,7 +82,8 @@ class History:
         if len(new) >= 8:  # fewer are quick to read again
             with suppress(OSError, CalibrationError, NotImplementedError):  # cannot be written
                 self._write(self._cache(serial), _packed(table))
-        rows = [row for row in _rows_of(table) if row.key in keys]
+        known = [each for each in table.to_pylist() if each['key'] in keys]
+        rows = [_row_of(each, serial) for each in known]
         return tuple(sorted(rows, key=lambda row: (row.time, row.source, row.key)))
 
     def _folder(self, serial: str, under: str = '') -> str:
@@ -169,25 +170,24 @@ def _schema() -> Any:
     return pa.schema([('key', pa.string()), *columns])
 
 
-def _rows_of(table: Any) -> list[Row]:
-    rows = []
-    for record in table.to_pylist():
-        where = f'{record.pop("key")}{ENDING} in the history'
-        for each in fields(Row):
-            value = record[each.name]
-            if str(each.type) == 'FloatArray':
-                record[each.name] = np.array(value or (), dtype=float)
-            elif str(each.type).startswith('tuple'):
-                record[each.name] = tuple(value or ())
-            elif value is None and 'None' not in str(each.type):
-                raise InputError(f'{where} has no {each.name}: {AWAY}')
-        size = len(record['names'])
-        square, offsets, tilts = (record[name] for name in ('covariance', 'offsets', 'tilts'))
-        numbers = np.concatenate([square, offsets, tilts])
-        fits = (square.size, offsets.size, tilts.size % max(size, 1)) == (size**2, size, 0)
-        if not (fits and np.isfinite(numbers).all()):
-            raise InputError(f'offsets or covariance of {where} do not match its names: {AWAY}')
-        record['covariance'] = square.reshape(size, size)
-        record['tilts'] = tilts.reshape(size, tilts.size // max(size, 1))
-        rows.append(Row(**record))
-    return rows
+def _row_of(record: dict[str, Any], serial: str) -> Row:
+    where = f'{record.pop("key")}{ENDING} in the history'
+    for each in fields(Row):
+        value = record[each.name]
+        if str(each.type) == 'FloatArray':
+            record[each.name] = np.array(value or (), dtype=float)
+        elif str(each.type).startswith('tuple'):
+            record[each.name] = tuple(value or ())
+        elif value is None and 'None' not in str(each.type):
+            raise InputError(f'{where} has no {each.name}: {AWAY}')
+    if record['serial'] != serial:
+        raise InputError(f'{where} is of robot {record["serial"]}, not {serial}: move it away')
+    size = len(record['names'])
+    square, offsets, tilts = (record[name] for name in ('covariance', 'offsets', 'tilts'))
+    numbers = np.concatenate([square, offsets, tilts])
+    fits = (square.size, offsets.size, tilts.size % max(size, 1)) == (size**2, size, 0)
+    if not (fits and np.isfinite(numbers).all()):
+        raise InputError(f'offsets or covariance of {where} do not match its names: {AWAY}')
+    record['covariance'] = square.reshape(size, size)
+    record['tilts'] = tilts.reshape(size, tilts.size // max(size, 1))
+    return Row(**record)

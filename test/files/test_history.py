@@ -149,6 +149,20 @@ def test_what_is_no_row_is_named(tmp_path, damaged):
         store.rows('SN 1/ö')
 
 
+def test_a_row_of_another_robot_is_named(tmp_path):
+    """As of 42a and 42A on a disk that takes both for one: they were compared as one robot."""
+    store = History(tmp_path)
+    for k in range(10):  # as many are cached
+        store.file(row(k, serial='42A'))
+    store.file(row(serial='42a'))
+    (path,) = tmp_path.glob('robot=42a/*')
+    other = path.rename(tmp_path / 'robot=42A' / path.name)
+    with pytest.raises(InputError, match=f'{path.name} .* of robot 42a, not 42A: move it away'):
+        store.rows('42A')
+    other.unlink()
+    assert len(store.rows('42A')) == 10
+
+
 def test_no_flipped_bit_is_read_as_another_number(tmp_path):
     store = History(tmp_path)
     numbers = np.random.default_rng(0).normal(size=(12, 12))
