@@ -191,6 +191,8 @@ class Collector:
             return 'the arm is moving'
         if stands[-1, 0] <= self._sampled_ns:
             return 'the arm stands and its pose is measured: move on'
+        if stands[-1, 0] < self._settled_ns and self.settings.mode == 'dwell':
+            return 'the arm stands, and nothing has been measured yet'
         return f'the arm stands for {1e-9 * (newest - int(stands[-1, 0])):.1f} s'
 
     def capture(self, place: str = '') -> tuple[int, str]:
@@ -224,7 +226,7 @@ class Collector:
         self._round(begin)  # end earlier stops
         before, dropped = len(self.sampler.fresh), self.dropped.copy()
         plan = Schedule(self._settled_ns, self._sampled_ns)
-        plan.add(newest, '', begin)
+        plan.add(newest, '', begin + round(self.settings.settle * 1e9))
         self._carry_out(plan)
         count = len(self.sampler.fresh) - before
         if count:
@@ -276,19 +278,28 @@ class Collector:
         seen = seen_stops(stands, rounds, self._settled_ns, self._late_ns, shortest)
         for found, now in zip(seen, rounds, strict=True):
             self.rests.note(None if found else self.track.noise_at_rest(ADVANCE_NS, now))
-        plan.of_stands(stands, until, None if ends_here else self.track.newest_ns, settings)
+        newest = None if ends_here else self.track.newest_ns
+        plan.of_stands(stands, until, newest, settings, self._measured)
         if stops := plan.stops:
             spans = [(plan.begins[k], plan.ends[k]) for k in stops]
             where = self.track.at(np.sum(spans, axis=1) // 2, standing=True).joints
             for k, span, joints in zip(stops, spans, where, strict=True):
-                if self._known.meets(*span, joints, 2.0 * settings.still):
+                near = 2.0 * settings.still
+                if self._measured(*span) and self._known.meets(*span, joints, near):
                     plan.why[k] = SAMPLED
+
+    def _measured(self, begin: int, end: int) -> bool:
+        """Tell whether measurements wait between two joint stamps."""
+        for rows in self.waiting.values():
+            stamps = rows.stamps - self.delay_ns
+            if np.searchsorted(stamps, begin) < np.searchsorted(stamps, end, 'right'):
+                return True
+        return False
 
     def _carry_out(self, plan: Schedule) -> None:
         self.rests.sampled += len(plan.stops)
         moving = self.settings.mode == 'continuous'
-        settle = 0 if moving else round(self.settings.settle * 1e9)
-        ends, calm = np.array(plan.ends), np.array(plan.begins) + settle
+        ends, calm = np.array(plan.ends), np.array(plan.begins)
         wanted = np.array([not why for why in plan.why], dtype=bool)
         found: list[Numbered] = []
         measured: set[int] = set()

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -127,7 +127,7 @@ class Schedule:
             self.ends.append(until)
             self.why.append(why)
             self.begins.append(begin)
-        if why in ('', SAMPLED):
+        if why == SAMPLED:
             self.sampled_ns = max(self.sampled_ns, self.done_ns)
 
     @property
@@ -136,16 +136,26 @@ class Schedule:
         return [k for k, why in enumerate(self.why) if not why]
 
     def of_stands(
-        self, stands: Stamps, until: int, newest: int | None, settings: Settings
+        self,
+        stands: Stamps,
+        until: int,
+        newest: int | None,
+        settings: Settings,
+        measured: Callable[[int, int], bool],
     ) -> None:
-        """Plan for stands (K, 2) up to a stamp; without the newest stamp all of them end there."""
+        """Plan for stands (K, 2) up to a stamp; without the newest stamp all of them end there.
+
+        `measured` tells whether there are measurements between two stamps. What is longer than
+        `longest_stop` is divided; the first part with any is the stop.
+        """
+        settle = round(settings.settle * 1e9)
         shortest = round(settings.shortest_stop * 1e9)
         longest = round(settings.longest_stop * 1e9)
-        for begin, end in stands.tolist():
+        for first, end in stands.tolist():
             goes_on = newest is not None and end >= newest
             if newest is None:
                 end = min(end, until)
-            begin = max(begin, self.done_ns)
+            begin = max(first, self.done_ns)
             if begin > until or end <= self.done_ns:
                 continue
             self.add(begin, MOVING)
@@ -155,14 +165,20 @@ class Schedule:
             if settings.mode == 'triggered':
                 self.add(min(end, until), 'not requested')
                 continue
-            last = min(end, begin + longest)
-            if last > until or (goes_on and last == end):
-                return  # not over yet
-            if last - begin < shortest:
-                self.add(last, 'the stop was too short')
-                continue
-            self.add(last, '', begin)
-            self.add(min(end, until), SAMPLED)
+            while begin < end:
+                last = min(end, begin + longest)
+                if last > until or (goes_on and last == end):
+                    return  # not over yet
+                calm = begin + (settle if begin == first else 1)  # the last part includes its end
+                if last - begin < shortest:
+                    self.add(last, 'the stop was too short')
+                elif measured(calm, last):
+                    self.add(last, '', calm)
+                    self.add(min(end, until), SAMPLED)
+                    break
+                else:
+                    self.add(last, '' if begin == first else MOVING, calm)
+                begin = last
         self.add(until, MOVING)
 
 

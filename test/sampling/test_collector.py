@@ -90,6 +90,28 @@ def test_a_long_stop_is_sampled_while_it_lasts():
     assert made.state() == 'the arm stands and its pose is measured: move on'
 
 
+@pytest.mark.parametrize('late', [2.1, 4.1, 6.0, 7.97])
+def test_a_long_stop_is_sampled_where_it_is_measured(late):
+    """As by hand, or when a tracker has found its target again: it was said to be measured."""
+    motion = stops(STOPS[:1], 1.0, 60.0)
+    joints = joint_events(motion, 12.0)
+    made = collector(longest_stop=2.0, settle=0.2)
+    assert play(made, [each for each in joints if each[0] < 1.8], finish=False) == []
+    assert made.state() == 'the arm stands for 1.8 s'
+    made = collector(longest_stop=2.0, settle=0.2)
+    assert play(made, joints, finish=False) == []
+    assert made.state() == 'the arm stands, and nothing has been measured yet'
+    assert made.unmeasured == 1
+    measured = pose_events(motion, 12.0, begin=late - 0.003)
+    made = collector(longest_stop=2.0, settle=0.2)
+    (sample,) = play(made, joints, measured[:1], finish=False)
+    assert sample.count == 1
+    assert not made.unused
+    assert made.unmeasured == 0
+    assert made.state() == 'the arm stands and its pose is measured: move on'
+    assert len(play(collector(longest_stop=2.0), joints, measured)) == 1
+
+
 def test_joints_are_those_of_the_time_of_the_measurements():
     """Noise of the encoders is averaged too, about half a turn as well."""
     rng = np.random.default_rng(3)

@@ -8,24 +8,29 @@ from calib_ros.settings import Settings
 
 S = 10**9
 MOVING = 'the arm was moving'
+NEVER = [(2, MOVING, 0), (5, '', 2), (8, MOVING, 5)]  # a stop of two parts, none measured
 
 
 @pytest.mark.parametrize(
-    ('stand', 'until', 'newest', 'done', 'sampled', 'expected'),
+    ('stand', 'until', 'newest', 'done', 'sampled', 'seen', 'expected'),
     [
-        ((2, 9), 10, 12, 0, 0, [(2, MOVING, 0), (5, '', 2), (9, SAMPLED, 0), (10, MOVING, 0)]),
-        ((2, 5), 5, 5, 0, 0, [(2, MOVING, 0)]),  # one that goes on is waited for
-        ((2, 6), 4, 6, 0, 0, [(2, MOVING, 0)]),
-        ((3, 8), 10, 12, 5, 5, [(8, SAMPLED, 0), (10, MOVING, 0)]),  # there is a sample of it
-        ((3, 8), 10, 12, 5, 0, [(8, '', 5), (10, MOVING, 0)]),  # its begin was dealt with
+        ((2, 9), 10, 12, 0, 0, 3, [(2, MOVING, 0), (5, '', 2), (9, SAMPLED, 0), (10, MOVING, 0)]),
+        ((2, 9), 8, 12, 0, 0, 6, [(2, MOVING, 0), (5, '', 2), (8, '', 5)]),  # measured later
+        ((2, 9), 10, 12, 0, 0, 1, [*NEVER, (9, MOVING, 8), (10, MOVING, 0)]),
+        ((2, 5), 5, 5, 0, 0, 3, [(2, MOVING, 0)]),  # one that goes on is waited for
+        ((2, 6), 4, 6, 0, 0, 3, [(2, MOVING, 0)]),
+        ((3, 8), 10, 12, 5, 5, 6, [(8, SAMPLED, 0), (10, MOVING, 0)]),  # there is a sample of it
+        ((3, 8), 10, 12, 5, 0, 6, [(8, '', 5), (10, MOVING, 0)]),  # its begin was dealt with
     ],
 )
 def test_a_stand_becomes_a_stop_of_the_longest_time_at_most(
-    stand, until, newest, done, sampled, expected
+    stand, until, newest, done, sampled, seen, expected
 ):
     plan = Schedule(done * S, sampled * S)
     stands, settings = S * np.array([stand]), Settings(shortest_stop=1.0, longest_stop=3.0)
-    plan.of_stands(stands, until * S, newest * S, settings)
+    plan.of_stands(
+        stands, until * S, newest * S, settings, lambda begin, end: begin <= seen * S <= end
+    )
     found = zip(plan.ends, plan.why, plan.begins, strict=True)
     assert [(end // S, why, begin // S) for end, why, begin in found] == expected
 
