@@ -45,7 +45,10 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     chain = load_chain(options.chain)
     table = read_table(options.csv, len(chain.joints), common.sessions_of(options))
     if len(table.fitted) != 1 or table.fitted[0].distances is not None or table.pairs:
-        raise InputError('a bag can hold only poses or positions of one session and one target')
+        raise InputError(
+            'a bag can hold only poses or positions of one session and one target, '
+            'some of them to fit'
+        )
     (fitted,) = table.fitted
     held_out = table.held_out[0] if table.held_out else fitted.select(np.zeros(0, int))
     oriented = bool(fitted.oriented.any() or held_out.oriented.any())

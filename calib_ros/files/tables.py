@@ -134,8 +134,6 @@ def _dataset(
 ) -> Dataset:
     made = made.kept()
     made.check_frames()
-    if made.test.all():
-        raise InputError(f'{made.path} has no rows to fit, only rows marked test')
     if eye_in_hand:
         made = replace(made, eye_in_hand=np.ones(len(made.lines), dtype=bool))
     if made.view[1] != ['']:

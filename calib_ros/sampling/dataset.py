@@ -147,7 +147,14 @@ class Dataset(Shown):
     by_line: bool = False  # stamps are the lines of a table, in seconds
 
     def problem(self, chain: Chain, settings: Settings | None = None, **more: Any) -> Problem:
-        """Return the problem for a chain, by default with the usual settings."""
+        """Return the problem for a chain, by default with the usual settings.
+
+        Raises InputError if all rows judge.
+        """
+        if not self.fitted:
+            raise InputError(
+                'the table has no rows to fit, only rows marked test in its column split'
+            )
         settings = settings or Settings()
         return Problem(
             with_lenses(chain, self.lenses),

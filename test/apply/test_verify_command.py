@@ -70,6 +70,17 @@ def test_an_arm_without_correction_passes_only_with_a_remark(cell, folder, run):
         assert ('this judges the calibration' in ' '.join(out.split())) == (not more)
 
 
+def test_rows_marked_test_are_judged_like_others(cell, folder, run):
+    """A table kept for judging is what `verify` is for."""
+    q = UR.random_joints(8, np.random.default_rng(3))
+    found = []
+    for held_out in (0, len(q)):
+        write_csv(folder / 'measured.csv', rows_of(measured(cell[0], q, repeats=1), held_out))
+        found.append(run(*VERIFY, 'result', '--tolerance', 1))
+    assert found[0][0] == 0
+    assert found[1] == found[0]
+
+
 def test_plan_writes_test_poses_that_are_seen(run, tmp_path):
     box = ('--box', 0.2, -0.5, 0.2, 1, 0.5, 1, '--tracker', 3, 0, 1)
     assert run('plan', '--chain', 'ur10e', '--iso9283', '--out', 'tests.csv', *box)[0] == 0
