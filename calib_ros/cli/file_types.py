@@ -41,8 +41,8 @@ FILE_KINDS = {
     'chain': ('a YAML file', 'give an arm as --chain, a calibration as --calibration'),
     'urdf': ('a URDF', 'give it as --chain'),
     'result': ('the result of identify', 'use workspace, or give it as --calibration'),
-    'image': ('an image', 'use images on its folder'),
-    'images': ('a folder of images', 'use images'),
+    'image': ('an image', 'use calib_ros images on its folder'),
+    'images': ('a folder of images', 'use calib_ros images'),
     'workbook': ('a workbook of another kind', 'save it as .xlsx or CSV'),
     'report': ('a report', 'read it; calibration.yaml beside it is the result'),
 }

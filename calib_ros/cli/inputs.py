@@ -77,16 +77,18 @@ def history_of(options: argparse.Namespace) -> tuple[History, Unread] | None:
 def calibration_of(path: Path, command: str, nominal: Chain | None = None) -> Calibration:
     """Return the calibration in a file, or in the folder of an identification."""
     refuse_others(path, command, 'chain', 'result')
-    if path.is_dir() and not calibration_file(path).exists():
-        for name in ('report.html', 'result.json'):  # updates have no report
-            if (path / name).exists():
+    file = calibration_file(path)
+    if not file.exists():
+        wanted = file.name == 'calibration.yaml'
+        for other in (file.with_name(name) for name in ('report.html', 'result.json')):
+            if wanted and other.exists():  # updates have no report
                 raise InputError(
-                    f'the result in {path} was not accepted, so there is no calibration; '
-                    f'{path / name} says why and what to do'
+                    f'the result in {file.parent} was not accepted, so there is no calibration; '
+                    f'{other} says why and what to do'
                 )
-        raise InputError(f'{path} holds no calibration.yaml: {GIVE_FOLDER}')
-    if not path.exists():
-        raise InputError(f'there is no calibration at {path}: {GIVE_FOLDER}')
+        lacks = f'{path} holds no' if path.is_dir() else 'there is no calibration at'
+        named = file.name if path.is_dir() else path
+        raise InputError(f'{lacks} {named}: {GIVE_FOLDER}')
     return load_calibration(path, nominal)
 
 

@@ -24,7 +24,7 @@ def bad_inputs():
     yield 'a link to nothing', (*csv_of, 'link.csv'), '(the link leads to gone.csv)\n'
     yield 'a column twice', (*csv_of, 'twice.csv'), 'are called x: rename all but one'
     yield 'too few rows', (*csv_of, 'few.csv'), 'too few different poses: 3 measured'
-    yield 'only test rows', (*csv_of, 'judging.csv'), 'judging.csv has no rows to fit'
+    yield 'only test rows', (*csv_of, 'judging.csv'), 'the table has no rows to fit'
     yield 'no such bag', (*bag_of, 'missing'), 'no bag at missing'
     yield 'an empty bag folder', (*bag_of, 'folder'), 'no .mcap or .db3 file is in it'
     yield 'a chain as table', (*bag_of, 'broken.yaml'), 'but identify takes a table or a bag'
@@ -63,6 +63,11 @@ def bad_inputs():
         'no calibration at none: give the folder written by ide',
     )
     yield 'not accepted', ('compare', 'refused', 'none'), 'refused was not accepted'
+    yield (
+        'not accepted, named as a file',
+        ('compare', 'refused/calibration.yaml', 'none'),
+        'refused was not accepted',
+    )
     yield 'a folder as calibration', ('compare', 'folder', 'none'), 'folder holds no calibration.y'
     yield (
         'a table as calibration',
