@@ -83,7 +83,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     else:
         show(found, screen)
         if options.out is None:
-            screen.bullet('nothing was saved: --out FOLDER writes the calibration and its report')
+            made = 'the calibration and its report' if found.result.accepted else 'the report'
+            screen.bullet(f'nothing was saved: --out FOLDER writes {made}')
         else:
             screen.say(common.written(options.out, contents))
     if filed is not None:  # last: a full disk there must not hide the result
@@ -301,11 +302,9 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
 def _rows(result: Identification) -> dict[str, str]:
     judged, effects = result.validation or result.fitted, len(result.chain.effects)
     before, after = figures = judged.figures
-    fitted, measured = f'{result.rank} parameters fitted', words.fitted_data(result)
+    fitted, measured = f'{result.rank} parameters fitted', words.fitted_to(result)
     if effects:
         fitted += f', {of_them(effects, "effect")}'
-    if result.outliers:
-        measured += f', {of_them(len(result.outliers), "outlier")} with little or no weight'
     corners, turn = words.change(figures, 'px'), words.change(figures, 'mrad')
     largest = f'{rounded(before.max_mm)} -> {rounded(after.max_mm)} mm'
     valid = result.region.in_words() if result.accepted and result.region is not None else ''

@@ -87,6 +87,7 @@ def identification_report(
             poses,
             (
                 ('Fitted', ', '.join((counted(result.rank, 'parameter'), *effects))),
+                ('Fitted to', words.fitted_to(result)),
                 ('Stated device noise', f'{_stated(problem, poses)}; one sigma; {scale}'),
                 ('Remaining error', words.times_in_words(result.noise)),
                 ('Judged by', result.validated_by),

@@ -146,7 +146,7 @@ def hints(found: Verification) -> list[str]:
         lines.append(f'{" and ".join(found.fitted)} refitted, before and after alike')
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
-        lines.append(f'{enough} poses with the same RMS error would decide')
+        lines.append(f'{enough} poses with the same RMS error would decide, these included')
     before, rms = (each.rms_mm for each in found.comparison.figures)
     if rms > before and not (found.mistake or found.uncorrected or causes(found)):
         lines.append('the nominal arm would be nearer: is the calibration that of this robot?')

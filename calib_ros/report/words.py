@@ -25,7 +25,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
-from calib_ros.shown import counted, rounded, some
+from calib_ros.shown import counted, of_them, rounded, some
 
 WEAK = Settings.largest_error
 """Standard deviation [m or rad] beyond which a parameter is named as weakly determined: an arm
@@ -98,6 +98,12 @@ def fitted_data(result: Identification) -> str:
     parts = [f'{poses:,} poses'] if poses or not corners else []
     parts += [f'{result.images:,} images with {corners:,} corners'] if corners else []
     return ' and '.join(parts)
+
+
+def fitted_to(result: Identification) -> str:
+    """Return what was fitted, and how much of it is outliers."""
+    outliers = f', {of_them(len(result.outliers), "outlier")} with little or no weight'
+    return fitted_data(result) + outliers * bool(result.outliers)
 
 
 def other_remarks(result: Identification) -> list[str]:

@@ -353,6 +353,7 @@ def test_distances_and_outliers_have_pages():
     page = page_of(report_of(problem, result))
     assert 'Outliers: ' in page.text
     assert 'touched planes are along one direction' in page.text
+    assert '160 poses, 1 of them an outlier with little or no weight' in page.text
     assert poses.source(int(np.flatnonzero(poses.outlier)[0])) in page.text
 
 
