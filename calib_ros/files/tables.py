@@ -48,7 +48,8 @@ def read_table(
 ) -> Dataset:
     """Read a CSV table, or one in any other layout.
 
-    Of several `sessions`, each after the first gets its own base and tool frames. `sigmas` are the
+    `joints` is their number; `dataset.problem(chain)` is what `identify` takes. Of several
+    `sessions`, each after the first gets its own base and tool frames. `sigmas` are the
     standard deviations [m, rad] of poses seen by a camera on the flange; with `eye_in_hand` all
     poses are of a fixed target in such a camera. `foreign` tells how to read a table from another
     system; `progress` receives the share read.
