@@ -11,8 +11,9 @@ squares,
 
     e = v^T S^+ v        v = X^T r - A^T H^+ J^T r    S = X^T X - A^T H^+ A    A = J^T X
 
-Products of all columns are summed from the end of the session and serve every stop. docs/model.md
-(Judgement) describes the search. Known distances between sockets say nothing about time.
+Products of all columns are summed from the end of the session and serve every stop. Stops a tenth
+of the shorter side apart are tried, then every stop near the best, of up to 400 samples;
+docs/model.md (Judgement) has the rules. Known distances between sockets say nothing about time.
 """
 
 from __future__ import annotations
