@@ -29,15 +29,12 @@ from calib_ros.files.rows import (
     settings_hash,
 )
 from calib_ros.identification.age import measured_at
-from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
+from calib_ros.identification.calibration import Calibration, load_calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.report import page
 from calib_ros.sampling.dataset import Dataset
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
-
-GIVE_FOLDER = 'give the folder written by identify --out'
-
 
 Unread: TypeAlias = dict[Path, list[tuple[str, int, int]]]
 """Paths to read, measurements first, with their files: sizes [bytes] and times of change [ns]."""
@@ -77,18 +74,6 @@ def history_of(options: argparse.Namespace) -> tuple[History, Unread] | None:
 def calibration_of(path: Path, command: str, nominal: Chain | None = None) -> Calibration:
     """Return the calibration in a file, or in the folder of an identification."""
     refuse_others(path, command, 'chain', 'result')
-    file = calibration_file(path)
-    if not file.exists():
-        wanted = file.name == 'calibration.yaml'
-        for other in (file.with_name(name) for name in ('report.html', 'result.json')):
-            if wanted and other.exists():  # updates have no report
-                raise InputError(
-                    f'the result in {file.parent} was not accepted, so there is no calibration; '
-                    f'{other} says why and what to do'
-                )
-        lacks = f'{path} holds no' if path.is_dir() else 'there is no calibration at'
-        named = file.name if path.is_dir() else path
-        raise InputError(f'{lacks} {named}: {GIVE_FOLDER}')
     return load_calibration(path, nominal)
 
 

@@ -311,8 +311,23 @@ def calibration_file(path: str | os.PathLike[str]) -> Path:
 
 @as_annotated
 def load_calibration(path: str | os.PathLike[str], nominal: Chain | None = None) -> Calibration:
-    """Read a calibration from its file or an identification's folder (`parse_calibration`)."""
+    """Read a calibration from its file or an identification's folder (`parse_calibration`).
+
+    Raises ConfigError if there is none, above all of a result that was not accepted.
+    """
     file = calibration_file(path)
+    if not file.exists():
+        names = 'report.html', 'result.json'  # updates have no report
+        other = next(filter(Path.exists, map(file.with_name, names)), None)
+        if other is not None and file.name == 'calibration.yaml':
+            raise ConfigError(
+                f'the result in {file.parent} was not accepted, so there is no calibration; '
+                f'{other} says why and what to do'
+            )
+        lacks = (
+            f'{path} holds no {file.name}' if file != Path(path) else f'no calibration at {path}'
+        )
+        raise ConfigError(f'{lacks}: give the folder written by identify --out')
     return parse_calibration(chain_text(file), str(file), nominal)
 
 

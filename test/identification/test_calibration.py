@@ -224,6 +224,19 @@ def test_a_calibration_is_read_from_its_file_or_folder(tmp_path):
         assert found.chain.joints[1].a == pytest.approx(UR.joints[1].a + 1e-3, abs=1e-12)
 
 
+def test_a_refused_result_has_no_calibration_and_says_so(tmp_path):
+    with pytest.raises(
+        ConfigError, match=f'{tmp_path} holds no calibration.yaml: give the folder'
+    ):
+        load_calibration(tmp_path)
+    (tmp_path / 'result.json').write_text('{}')
+    for path in (tmp_path, tmp_path / 'calibration.yaml'):
+        with pytest.raises(ConfigError, match=f'the result in {tmp_path} was not accepted'):
+            load_calibration(path)
+    with pytest.raises(ConfigError, match=r'no calibration at .*other\.yaml'):
+        load_calibration(tmp_path / 'other.yaml')
+
+
 GOOD = {'nominal': nominal_document(UR), 'rms_mm_after': 0.1, 'world_frame': 'tracker'}
 
 
