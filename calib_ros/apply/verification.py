@@ -50,7 +50,7 @@ from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Settings
-from calib_ros.shown import LISTED, Shown
+from calib_ros.shown import LISTED, Shown, as_html, rounded
 from calib_ros.values import SAME
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
@@ -121,6 +121,19 @@ class Verification(Shown):
     """What explains measurements that are further off than any arm."""
     step: Step | None = None
     """What moved during the measurement, if the arm exceeds the limit."""
+
+    def _repr_html_(self) -> str:
+        before, after = self.comparison.figures
+        ends = ' to '.join(rounded(1e3 * each) for each in (self.lower, self.upper))
+        like = f'RMS over poses like these ({100 * self.confidence:g} %: {ends})'
+        rows = (
+            ('position error [mm]', 'before', 'after'),
+            ('RMS', rounded(before.rms_mm), rounded(after.rms_mm)),
+            ('largest', rounded(before.max_mm), rounded(after.max_mm)),
+            (like, '', rounded(1e3 * self.rms)),
+            ('limit', '', '' if self.limit is None else rounded(1e3 * self.limit)),
+        )
+        return as_html(self.verdict, (), rows)
 
     @property
     def configurations(self) -> int:

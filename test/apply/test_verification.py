@@ -133,6 +133,10 @@ def test_pass_fail_and_undecided(cell, arm, program):
     assert 5 < near.needed < 500
     text = in_words(near)
     assert f'about {near.needed} poses' in text
+    shown = near._repr_html_()
+    assert '<strong>UNDECIDED</strong>' in shown
+    for value in (near.rms, near.lower, near.upper, near.limit):
+        assert rounded(1e3 * value) in shown
     errors = 1e3 * near.comparison.after.position[near.group == 2]
     assert near.each[2].after == pytest.approx(np.linalg.norm(errors.mean(axis=0)))
     heads = [line.split() for line in text.splitlines()]
