@@ -72,6 +72,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         beside = {options.out.with_name(name): text for name, text in pages.items()}
         write_together({options.out: joints_csv(joints), **beside}, overwrite=options.force)
         screen.say(f'wrote {options.out}' + (f' and {page}' if pages else ''))
+    else:
+        screen.bullet('nothing was saved: --out FILE writes the poses and a report')
     return 0
 
 
