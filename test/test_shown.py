@@ -19,7 +19,8 @@ from calib_ros.apply.design import Design
 from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.reasons import Reason, Rule
-from calib_ros.shown import Shown, rows_in_words
+from calib_ros.report.words import interval_mm
+from calib_ros.shown import Shown, rounded, rows_in_words
 
 CHAIN = calib_ros.load_chain('ur10e')
 JOINTS = CHAIN.random_joints(200, np.random.default_rng(1))
@@ -245,6 +246,16 @@ def test_without_pandas_that_is_said(monkeypatch):
     monkeypatch.setitem(sys.modules, 'pandas', None)
     with pytest.raises(calib_ros.CalibrationError, match='pip install pandas'):
         RESULT.to_frame()
+
+
+@pytest.mark.parametrize(
+    ('value', 'text'),
+    [(0.0, '0.000'), (0.00123, '0.0012'), (281.7194, '281.719'), (127275.477, '127,275')],
+)
+def test_numbers_have_the_digits_that_a_reader_needs(value, text):
+    assert rounded(value) == text
+    assert rounded(-value).lstrip('-') == text
+    assert interval_mm(value, value) == f'{text} to {text}'
 
 
 def test_a_notebook_shows_the_verdict_and_its_reasons():

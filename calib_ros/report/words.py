@@ -82,7 +82,8 @@ def between(judged: Comparison | None, when: int) -> str:
 def interval_mm(lower: float, upper: float) -> str:
     """Return an interval [mm] with as many decimals at both ends."""
     end = rounded(upper)
-    return f'{lower:.{len(end.partition(".")[2])}f} to {end}'
+    decimals = len(end.partition('.')[2])
+    return f'{lower:{"" if decimals else ","}.{decimals}f} to {end}'
 
 
 def limits_mm(judged: Comparison | None, when: int) -> list[float] | None:
