@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors shared by neighbouring poses.
+"""Errors shared by neighbouring poses, which then carry less information than their number.
 
-A tracker drifts, and model errors change slowly over the joint space, so neighbours have similar
-errors and carry less information than their number. Configurations are neighbours in succession or
-in joint space. Residuals r of white noise of unit variance have the covariance B = I - Q Q^T (Q:
-orthonormal columns of the Jacobian), so a quadratic form r^T A r has
+Configurations are neighbours in succession or in joint space. Residuals r of white noise of unit
+variance have the covariance B = I - Q Q^T (Q: orthonormal columns of the Jacobian), so a quadratic
+form r^T A r has
 
     mean tr(A B)        covariance with r^T C r: 2 tr(A B C B)
 
@@ -15,9 +14,8 @@ neighbours, the noise is modelled as a sum of independent and fading parts,
 
     V = v_0 I + sum_k v_k K_k        K_k = exp(-distance / length_k)
 
-where the sizes v_k >= 0 equate the forms r^T K_k r with their expected values (MINQUE, Rao 1971),
-which allows for errors absorbed by the fit. The covariance of the parameters is then
-H^-1 (J^T V J) H^-1.
+where the sizes v_k >= 0 equate the forms r^T K_k r with their expected values (MINQUE, Rao 1971).
+The covariance of the parameters is then H^-1 (J^T V J) H^-1.
 """
 
 from __future__ import annotations
@@ -28,7 +26,6 @@ from functools import cached_property
 
 import numpy as np
 from scipy import linalg, special
-from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
@@ -37,7 +34,7 @@ from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, Index, cos_sin
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
 from calib_ros.values import LARGEST
 
 DECAYS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
@@ -84,8 +81,8 @@ class Stops:
     def __len__(self) -> int:
         return len(self.count)
 
-    def links(self, kind: str) -> csr_array:
-        """Return (n, n): 1 for neighbours."""
+    def links(self, kind: str) -> FloatArray:
+        """Return (n, n): 1 for neighbours, else 0."""
         count = len(self)
         if kind == 'successive':
             first = np.flatnonzero(np.diff(self.time) == 1.0)
@@ -95,9 +92,8 @@ class Stops:
             first, second = np.repeat(np.arange(count), NEARBY + 1), nearest.ravel()
             good = (first != second) & (far.ravel() < ELSEWHERE / 2)
             first, second = first[good], second[good]
-        ends = (np.append(first, second), np.append(second, first))
-        links = csr_array((np.ones(2 * len(first)), ends), shape=(count, count))
-        links.data[:] = 1.0
+        links = np.zeros((count, count))
+        links[first, second] = links[second, first] = 1.0
         return links
 
     def kernel(self, kind: str, length: float) -> FloatArray:
@@ -167,7 +163,6 @@ class _Forms:
         self._basis: dict[int, FloatArray] = {}
         self._residual: dict[int, FloatArray] = {}
         self._known: dict[int, FloatArray] = {}
-        self._white: dict[int, FloatArray] = {}
         self.parts: list[int] = []
         first = 0
         for part, each in enumerate(units.parts):
@@ -180,7 +175,6 @@ class _Forms:
             self._basis[part] = np.ascontiguousarray(turned)
             self._residual[part] = left[block].reshape(shape).T
             self._known[part] = each.any(axis=0).T.astype(float)
-            self._white[part] = gram(basis[block].T)
             self.parts.append(part)
 
     def _moments(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
@@ -188,14 +182,15 @@ class _Forms:
         inner, alone = list[FloatArray](), list[FloatArray]()
         for part, own in matrices.items():
             basis, known, count = self._basis[part], self._known[part], len(own)
-            crossed, traces = np.zeros((count, basis.shape[2] ** 2)), np.zeros((count, count))
+            width = basis.shape[2]
+            crossed, traces = np.zeros((count, width, width)), np.zeros((count, count))
             for seen in np.unique(known, axis=1).T:
-                alike = (known == seen[:, np.newaxis]).all(axis=0)
+                rows = basis[:, (known == seen[:, np.newaxis]).all(axis=0)]
                 both = own * np.outer(seen, seen)
-                more, common = _crossed(basis[:, alike], own, both)
-                crossed += more.reshape(count, -1)
-                traces += alike.sum() * gram(both) - 2.0 * common
-            inner.append(crossed)
+                spread = (both @ rows.reshape(len(rows), -1)).reshape(count, -1, width)
+                crossed += rows.reshape(-1, width).T @ spread
+                traces += rows.shape[1] * gram(both) - 2.0 * gram(spread)
+            inner.append(crossed.reshape(count, -1))
             alone.append(traces)
         return np.asarray(gram(np.concatenate(inner)) + linalg.block_diag(*alone))
 
@@ -204,24 +199,19 @@ class _Forms:
         pairs = [(self._residual[part], own) for part, own in matrices.items()]
         return np.concatenate([(r * (own @ r)).sum(axis=(1, 2)) for r, own in pairs])
 
-    def test(self, part: int, links: csr_array) -> tuple[float, float]:
+    def test(self, part: int, links: FloatArray) -> tuple[float, float]:
         """Return the excess correlation of linked residuals and its score, N(0, 1) for none."""
-        basis, residual, known = self._basis[part], self._residual[part], self._known[part]
-        product = (links @ basis.reshape(len(basis), -1)).reshape(basis.shape)
-        product *= known[:, :, np.newaxis]
-        white = self._white[part]
-        linked = basis.reshape(-1, len(white)).T @ product.reshape(-1, len(white))
+        basis, known = self._basis[part], self._known[part]
+        matrices = {part: np.array([np.eye(len(links)), links])}
+        size, form = self._values(matrices).tolist()
         pairs = float((known * (links @ known)).sum())
-        size = float((residual**2).sum())
-        freedom = float(known.sum() - np.trace(white))
+        freedom = float(known.sum() - (basis**2).sum())
         if not (size > 0.0 and pairs > 0.0 and freedom > 1.5):  # one alone has a constant ratio
             return 0.0, 0.0
-        ratio = -float(np.trace(linked)) / freedom
-        both = float((linked**2).sum() + pairs - 2.0 * (product**2).sum())
-        mixed = float((linked * white).sum() - 2.0 * (product * basis).sum())
-        alone = float((white**2).sum() + known.sum() - 2.0 * (basis**2).sum())
-        variance = 2.0 * max(both - 2.0 * ratio * mixed + ratio**2 * alone, 1e-300)
-        excess = float((residual * (links @ residual)).sum()) * freedom / size - ratio * freedom
+        ratio = -float((basis * np.tensordot(links, basis, 1)).sum()) / freedom
+        along = np.array([-ratio, 1.0])
+        variance = 2.0 * max(float(along @ self._moments(matrices) @ along), 1e-300)
+        excess = form * freedom / size - ratio * freedom
         return excess / pairs, excess / float(np.sqrt(variance))
 
     def sizes(self, kernels: dict[int, list[tuple[str, float]]]) -> dict[int, FloatArray]:
@@ -252,31 +242,6 @@ def nonnegative(moments: FloatArray, values: FloatArray) -> FloatArray:
     along = (values / scale) @ directions / roots
     sizes = optimize.nnls(roots[:, np.newaxis] * directions.T, along)[0]
     return np.asarray(sizes / scale)
-
-
-def _crossed(
-    basis: FloatArray, own: FloatArray, both: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return Q^T A Q (K, P, P) of columns Q (n, c, P), and the traces (K, K) tr(A C Q Q^T).
-
-    Of matrices A (K, n, n), the first of which is the identity, and, for the traces, those between
-    the rows that were measured.
-    """
-    columns, rows = basis.reshape(len(basis), -1), basis.reshape(-1, basis.shape[2])
-    if columns.shape[1] <= len(columns):
-        spread = both @ columns
-        return rows.T @ spread.reshape(-1, *rows.shape), gram(spread)
-    crossed = [each.T @ each for each in (rows, *(_rooted(basis, each) for each in own[1:]))]
-    spread = both @ (columns @ columns.T)
-    return np.array(crossed), spread.reshape(len(both), -1) @ both.reshape(len(both), -1).T
-
-
-def _rooted(basis: FloatArray, matrix: FloatArray) -> FloatArray:
-    """Return C^T Q (n c, P) of columns Q (n, c, P), with C C^T the positive matrix (n, n)."""
-    size = len(matrix)
-    root = np.linalg.cholesky(matrix + ROUNDING * np.diag(np.diag(matrix)))
-    turned = linalg.blas.dtrmm(1.0, root.T, basis.reshape(size, -1).T, side=1, trans_a=1)
-    return np.asarray(turned.T.reshape(-1, basis.shape[2]))
 
 
 def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> tuple[Stops, int]:
@@ -346,39 +311,31 @@ def _successive(
     """Return by part J^T K J of errors fading in succession, for (length, size) each."""
     found = {part: np.zeros((len(names), len(names))) for part in kernels}
     for samples in system.sets if kernels else ():
-        past, last = dict[int, FloatArray](), 0
+        past, last = dict[int, FloatArray](), -1
         for numbers, sums in samples.sums(chain, names, samples.observations.stops):
             for part in kernels.keys() & range(len(sums)):
                 rows, own = sums[part][:-1], kernels[part]
-                products, past[part] = _fading(rows, numbers - last, own, past.get(part))
+                before = past.get(part, np.zeros((len(own), *rows.shape[:2])))
+                products, past[part] = _fading(rows, own, before, int(numbers[0]) - last)
                 found[part] += products
             last = int(numbers[-1])
     return found
 
 
 def _fading(
-    rows: FloatArray,
-    time: Index,
-    kernels: Sequence[tuple[float, float]],
-    before: FloatArray | None,
+    rows: FloatArray, kernels: Sequence[tuple[float, float]], before: FloatArray, first: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return J^T K J of rows (P, c, n) of stops at times (n,), and their faded sums (P c, K).
+    """Return J^T K J of rows (P, c, n) of successive stops, and their faded sums (K, P, c).
 
-    Runs of stops are multiplied with a root of the sum of K kernels, and with what is left of all
-    stops before: their sums, `before` those at time zero.
+    `before` are the sums up to `first` stops before: none if one stop spans two blocks.
     """
-    lengths, sizes = np.transpose(kernels)
-    flat, last = rows.reshape(-1, len(time)), 0
-    past = [np.zeros((len(flat), len(sizes))) if before is None else before]
-    turned, here = np.empty_like(flat), []
-    for first in range(0, len(time), SOME_POSES // 4):
-        run = np.s_[first : first + SOME_POSES // 4]
-        then, own = time[run, np.newaxis], flat[:, run]
-        fade = np.exp(-np.abs(then - time[run])[..., np.newaxis] / lengths)
-        turned[:, run] = own @ np.linalg.cholesky(fade @ sizes)
-        here.append(own @ (np.exp((last - then) / lengths) * sizes))
-        past.append(past[-1] * np.exp((last - then[-1]) / lengths) + own @ fade[-1])
-        last = int(then[-1, 0])
-    one, other = (np.concatenate(x, axis=1).reshape(len(rows), -1) for x in (here, past[:-1]))
-    cross = one @ other.T
-    return gram(turned.reshape(len(rows), -1)) + cross + cross.T, past[-1]
+    from scipy import signal  # slow to import, rarely needed
+
+    past, mixed = np.empty_like(before), np.zeros_like(rows)
+    for k, (length, size) in enumerate(kernels):
+        fade = np.exp(-1.0 / length)
+        start = fade**first * before[k, ..., np.newaxis]
+        sums, _ = signal.lfilter([1.0], [1.0, -fade], rows, zi=start)
+        past[k], mixed = sums[..., -1], mixed + size * sums
+    cross = rows.reshape(len(rows), -1) @ mixed.reshape(len(rows), -1).T
+    return cross + cross.T - sum(size for _, size in kernels) * gram(rows), past

@@ -149,7 +149,7 @@ def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
     found = forms._moments(dict.fromkeys((0, 1), matrices))
     np.testing.assert_allclose(found, expected, atol=1e-9)
     links = units.links('successive')
-    dense = whole(1, links.toarray())
+    dense = whole(1, links)
     free = left[60:, 60:]
     ratio = np.trace(dense @ left) / np.trace(free)
     centred = dense @ left - ratio * whole(1, np.eye(count)) @ left
@@ -192,9 +192,9 @@ def test_neighbours_are_the_next_stop_and_the_three_nearest():
     expected = np.maximum(expected, expected.T)
     assert expected[:11, 11:].any()  # the third nearest of a set of three is in the other one
     expected[:11, 11:] = expected[11:, :11] = 0.0
-    np.testing.assert_array_equal(units.links('near').toarray(), expected)
+    np.testing.assert_array_equal(units.links('near'), expected)
     follows = np.abs(np.subtract.outer(time, time)) == 1.0
-    np.testing.assert_array_equal(units.links('successive').toarray(), follows)
+    np.testing.assert_array_equal(units.links('successive'), follows)
     for kind, distance in (('near', apart), ('successive', np.abs(np.subtract.outer(time, time)))):
         root = np.sqrt(np.outer(units.count, units.count))
         np.testing.assert_allclose(units.kernel(kind, 0.7), root * np.exp(-distance / 0.7))
