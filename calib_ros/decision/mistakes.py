@@ -3,15 +3,11 @@
 """Usual mistakes, tried out but never corrected: units, conventions, joints, the wrong arm.
 
 If the nominal arm misses the measurements by more than faulty arms do, each suspected mistake is
-undone in some samples or in the chain, and base and tool are refitted in closed form (`start.py`);
-the best few are refined by least squares. A mistake is named if undoing it reduces the typical
-error below NEARER times the original and to that of a faulty arm; so are those that explain nearly
-as much. If none does, the positions are tried without the orientations, then parts of the rows
-alone, then several mistakes at once.
-
-The typical error (distance plus angle times LEVER) is that of all but possible gross errors.
-Mistakes without effect cannot be detected: the zero of the first joint is a rotation of the base,
-that of the last joint one of the tool.
+undone, and base and tool are refitted in closed form (`start.py`); the best few are refined by
+least squares. Mistakes are named if undoing them reduces the typical error (distance plus angle
+times LEVER, of all but possible gross errors) below NEARER times the original and to that of a
+faulty arm. The zero of the first joint is a rotation of the base, that of the last joint one of
+the tool, so neither can be detected.
 """
 
 from __future__ import annotations
@@ -27,7 +23,7 @@ from calib_ros.decision.lost_rows import dead, in_any_order, repeating, row_loss
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import FIRST, ORIENTATIONS, hidden, suspects
-from calib_ros.decision.trials import Bare, Trial, in_frames, misses, refined, trial_of
+from calib_ros.decision.trials import Trial, in_frames, misses, refined, trial_of
 from calib_ros.decision.undoing import Sets, Suspect
 from calib_ros.estimation.levels import (
     ALIKE,
@@ -226,7 +222,6 @@ def _named(
 ) -> Explained | None:
     """Return the mistakes that explain the sets best; only of what is written in each row."""
     rough, tried = [], []
-    bare: Bare = {}
     of_images = _of_images(problem)
     likely = suspects(chain, given.sets, of_images)
     for each in (*likely, *in_any_order(chain, given.sets[0], of_images)):
@@ -235,7 +230,7 @@ def _named(
         few = given.sets
         if each.rows:
             few = tuple(_moved(problem, one, each.rows).spread() for one in sets)
-        found = trial_of(each.chain or chain, each.undone(few), bare)
+        found = trial_of(each.chain or chain, each.undone(few))
         if found is not None and found.share < given.share:
             rough.append((found, each))
     for found, each in sorted(rough, key=lambda one: one[0].share)[:TRIED]:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
 
@@ -23,9 +22,6 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.settings import LEVER
-
-Bare: TypeAlias = dict[tuple[int, int, str], tuple[FloatArray, Chain, Observations]]
-"""Poses of bare arms, which most suspects leave unchanged; what is kept keeps its id."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,18 +51,12 @@ class Trial:
         return self.error / max(self.spread, 1e-9)
 
 
-def trial_of(chain: Chain, sets: Sets, bare: Bare | None = None) -> Trial | None:
-    """Return the chain with frames for some samples in closed form, set by set.
-
-    `bare` caches the poses of arms tried before.
-    """
-    spreads, arms, bare = [], [], {} if bare is None else bare
+def trial_of(chain: Chain, sets: Sets) -> Trial | None:
+    """Return the chain with frames for some samples in closed form, set by set."""
+    spreads, arms = [], []
     for each in sets:
         alone = replace(each, base='base', tool='tool')
-        key = id(each.joints), id(chain.joints), chain.convention
-        if key not in bare:
-            bare[key] = flange(chain, alone), chain, each
-        arm = bare[key][0]
+        arm = flange(chain, alone)
         known = chain.all_frames  # other robots have only a base and a tool
         own = replace(chain, base=known.get(each.base), tool=known.get(each.tool))
         best = _nearest(own, alone, arm, np.ones(len(alone), dtype=bool))

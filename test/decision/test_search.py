@@ -104,7 +104,7 @@ def searched(monkeypatch):
     """Return a function that sets the suspects, and the share of errors that some leave."""
 
     def search(options, shares, pairs=()):
-        def trial_of(chain, sets, bare=None):
+        def trial_of(chain, sets):
             share = shares.get(''.join(sorted(sets[0])), 1.0)
             return SimpleNamespace(share=share, error=share) if share else None
 
