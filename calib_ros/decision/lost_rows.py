@@ -2,22 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables put together wrongly: rows lost or repeated, columns dead or in any order.
 
-Where a row is missing in one of two tables put side by side, later rows are mismatched. Base and
-tool are found from the first or last third of the session. Then each measurement i is compared
-with the joint values i + s for small shifts s: one shift fits before a row k, another from there
-on, and one of them is zero.
+A row missing in one of two tables put side by side mismatches later rows: one shift s of the joint
+values fits the measurements before a row k, another from there on, and one of them is zero. Base
+and tool are found from the first or last third of the session.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from itertools import permutations, product
 
 import numpy as np
 
-from calib_ros.decision.suspects import rows_away
+from calib_ros.decision.suspects import reordered, rows_away
 from calib_ros.decision.trials import in_frames, misses
 from calib_ros.decision.undoing import Sets, Suspect
 from calib_ros.estimation.levels import LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
@@ -89,20 +87,10 @@ def in_any_order(chain: Chain, seen: Observations, of_images: bool) -> Iterator[
     measured = (few.inverted() if few.inverse else few).positions[:, np.newaxis]
     steps = (np.linalg.norm(np.diff(each, axis=0), axis=2) for each in (reached, measured))
     away = np.median(np.abs(np.subtract(*steps)), axis=0)
-    for order in orders[np.argsort(away)[: SEVERAL * TRIED]].tolist():
-        columns = ','.join(f'q{k}=q{place + 1}' for k, place in enumerate(order, 1))
-        given = [chain.joint_names[k] for k in np.argsort(order)]
-        yield Suspect(
-            f'the joint values are in the order {", ".join(given)}',
-            'correct it in --places' if of_images else f'--columns {columns}',
-            (partial(_ordered, order=order),),
-            3,
-            published='set the order of joint_names, start without resume',
-        )
-
-
-def _ordered(each: Observations, order: list[int]) -> Observations:
-    return replace(each, joints=each.joints[:, order])
+    for order in orders[np.argsort(away)[: SEVERAL * TRIED]]:
+        given = ', '.join(chain.joint_names[k] for k in np.argsort(order))
+        found = reordered(f'the joint values are in the order {given}', order, rank=3)
+        yield replace(found, remedy='correct it in --places') if of_images else found
 
 
 def dead(chain: Chain, sets: Sets) -> Suspect | None:

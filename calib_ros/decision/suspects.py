@@ -257,10 +257,7 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
         where = f'in another order, {" and ".join(names[:more])} last'
         orders[where] = [*range(last - more, last), *range(last - more)]
     for where, places in orders.items():
-        columns = ','.join(f'q{k}=q{place + 1}' for k, place in enumerate(places, 1))
-        published = 'set the order of joint_names, start without resume'
-        what, change = f'the joints are {where}', (joints_by(same[places]),)
-        yield Suspect(what, f'--columns {columns}', change, 2, published=published, part='order')
+        yield replace(reordered(f'the joints are {where}', places, rank=2), part='order')
     ends = ((0, 'device moves'), (len(names) - 1, 'target does not move'))
     for k, stands in ends:
         what, remedy = f'the {stands} with {names[k]}', 'leave this joint out of the chain file'
@@ -272,6 +269,14 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
             what = f'{names[k]} is not given against {names[k - 1]}: they are coupled'
             remedy = f'--columns q{k + 1}=q{k + 1}{way}q{k}'
             yield Suspect(what, remedy, (joints_by(coupled),), 2, part=names[k])
+
+
+def reordered(what: str, places: Sequence[int], rank: int) -> Suspect:
+    """Return that joint k is in another of the places (n,)."""
+    columns = ','.join(f'q{k}=q{place + 1}' for k, place in enumerate(places, 1))
+    change = joints_by(np.eye(len(places))[[*places]])
+    published = 'set the order of joint_names, start without resume'
+    return Suspect(what, f'--columns {columns}', (change,), rank, published=published)
 
 
 def hidden(chain: Chain, others: Sequence[Suspect]) -> list[tuple[Suspect, ...]]:
