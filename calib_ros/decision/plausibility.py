@@ -1,27 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Implausible results with good figures: one sentence each, and what to do (docs/model.md).
+"""Implausible results with good figures: one sentence each, and what to do.
 
-Lens. If other intrinsics of a camera explain most of the residuals, the given ones belong to
-another zoom, focus or image size. If the arm imitates the lens, the result is refused: fitted with
-the lens it would be another arm, not just a more accurate one.
-
-Sessions. If sessions that share neither base nor tool fit far better alone, they are of two arms,
-or of one before and after something happened to it; their mean is neither.
-
-Motion. Stamps that jitter, clocks that drift, and smoothing of the device or of the joint states
-leave errors that are larger where the arm is faster or accelerates more; nothing of space does.
-
-Lag. A device that smooths, late stamps or a creeping arm measure each pose towards the previous
-stop, at joint values q_i - w (q_i - q_i-1): a delay w with the last move as velocity. The arm
-imitates what depends on q_i alone, and may become worse; the rest is most of the residuals. Play
-of the joints, which depends on the sign of that move, looks alike but explains more.
-
-Order. If one joint only goes one way during the session, what drifts with time is fitted as its
-error, and no test can tell them apart.
-
-Sigmas. In millimetres instead of metres they leave the arm no room: all errors are below them, and
-the poses add nothing to the priors.
+docs/model.md (Suspicions) explains them. An arm that imitates a wrong lens or a lag is another
+arm, not just a less accurate one, so the result is refused.
 """
 
 from __future__ import annotations
@@ -139,7 +121,7 @@ def _sessions(problem: Problem, result: Identification) -> str:
     if len(sessions) < 2 or result.noise.consistent or moved:
         return ''
     worst = 0.0
-    for first, *more in (map(_some, s) for s in sessions):
+    for first, *more in (map(Observations.some_images, s) for s in sessions):
         try:
             alone = fit(replace(problem, observations=first, more=more, held_out=()))[2]
         except (CalibrationError, np.linalg.LinAlgError):
@@ -152,12 +134,6 @@ def _sessions(problem: Problem, result: Identification) -> str:
         'times as well or better. Is it the same robot, did nothing happen to it in between, and '
         'are the devices true to scale? Identify each alone (--session) and compare them'
     )
-
-
-def _some(each: Observations) -> Observations:
-    """Return evenly spread poses or whole images."""
-    step = 1 + int(each.images[-1]) // SOME_POSES
-    return each.select(each.images % step == 0)
 
 
 def _motion(problem: Problem, result: Identification) -> str:

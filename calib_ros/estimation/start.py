@@ -33,7 +33,7 @@ from calib_ros.estimation.leastsquares import (
     triangular_factor,
 )
 from calib_ros.estimation.levels import TELLING
-from calib_ros.estimation.observations import SOME_POSES, Observations, numbered
+from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
 from calib_ros.estimation.robust import robust_fit, thorough_fit
@@ -68,8 +68,7 @@ def start_frames(problem: Problem) -> Chain:
         alone = replace(observations, base='base', tool='tool')
         if alone.pixels is not None:
             lens = require_lens(view.frame(alone.camera).lens, alone.camera)
-            share = -(-(int(alone.images[-1]) + 1) // SOME_POSES)
-            alone = board_poses(alone.select(alone.images % share == 0), lens)
+            alone = board_poses(alone.some_images(), lens)
         view = _start_one(view, alone, sigmas, problem.loss)
         for key, name in (('base', base), ('tool', tool)):
             frame = replace(view.frame(key), fixed=chain.frame(name).fixed)

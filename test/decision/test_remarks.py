@@ -97,7 +97,7 @@ def test_two_sessions_are_of_one_arm_unless_each_fits_far_better_alone(change, t
         return None, None, SimpleNamespace(noise=SimpleNamespace(position=size))
 
     monkeypatch.setattr(plausibility, 'fit', fit)
-    monkeypatch.setattr(plausibility, '_some', lambda each: each)
+    monkeypatch.setattr(plausibility.Observations, 'some_images', lambda each: each)
     noise = SimpleNamespace(consistent=change.get('consistent', False), position=10.0)
     refusals = [SimpleNamespace(rule=rule) for rule in change.get('rules', ())]
     result = SimpleNamespace(noise=noise, refusals=refusals)
