@@ -122,11 +122,6 @@ def changes_in_words(changed: Sequence[Sequence[Explanation]]) -> str:
     return '; '.join(map(reason_in_words, changed))
 
 
-def names_of(changed: Sequence[Sequence[Explanation]]) -> list[tuple[Parameter, ...]]:
-    """Return the parameters of all explanations of several changes."""
-    return [each.names for reasons in changed for each in reasons]
-
-
 def reasons_document(reasons: Sequence[Explanation]) -> list[dict[str, Any]]:
     """Return explanations as plain values."""
     return [

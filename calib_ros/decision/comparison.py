@@ -63,7 +63,8 @@ class Residuals:
 
     def figures(self, which: Flags) -> ErrorFigures:
         """Return RMS, mean and maximum over the pairs of a mask (N,)."""
-        distance, angle, away = (lengths[which] for lengths in self._lengths)
+        parts = self.position, self.orientation, self.pixels
+        distance, angle, away = (norms(part[which]) for part in parts)
         distance, angle = 1e3 * distance, 1e3 * angle[~np.isnan(angle)]
         away = away[~np.isnan(away)]
         return ErrorFigures(
@@ -75,10 +76,6 @@ class Residuals:
             float(np.sqrt(np.mean(angle**2))) if angle.size else None,
             float(np.sqrt(np.mean(away**2))) if away.size else None,
         )
-
-    @cached_property
-    def _lengths(self) -> list[FloatArray]:
-        return [norms(part) for part in (self.position, self.orientation, self.pixels)]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

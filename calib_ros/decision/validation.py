@@ -184,12 +184,10 @@ def _leave_one_place_out(
             rest = [name for name in wanted if name in kept and name not in own]
             found.append(minimise(minimise(chain, rest, others).chain, own, left).chain)
     number = {base: k for k, place in enumerate(places) for base in place}
-    parts = [
-        compare(chains[0][number[each.base]], chains[1][number[each.base]], [each])
-        for each in problem.sets
-    ]
     groups = np.concatenate([np.full(len(each), number[each.base]) for each in problem.sets])
-    first = joined([part.before for part in parts], groups)
-    second = joined([part.after for part in parts], groups)
+    first, second = (
+        joined([residuals(side[number[each.base]], each) for each in problem.sets], groups)
+        for side in chains
+    )
     judged = Comparison(first, second, ~fitted.robust.outliers)
     return judged, f'leaving out one of {len(places)} places at a time{judged.omitted}'

@@ -93,11 +93,8 @@ def image_products(rows: FloatArray, begins: Index, first: int | None = None) ->
     size, _, count = rows.shape
     points = np.diff(begins, append=count)
     most = int(points.max())
-    if len(points) * most == count:
-        full = rows.reshape(size, 2, len(points), most)
-    else:
-        full = np.zeros((size, 2, len(points), most))
-        full[:, :, np.arange(most) < points[:, np.newaxis]] = rows
+    full = np.zeros((size, 2, len(points), most))
+    full[:, :, np.arange(most) < points[:, np.newaxis]] = rows
     parts = full.transpose(1, 2, 0, 3)
     return np.asarray((parts[:, :, :first] @ parts.swapaxes(2, 3)).sum(axis=0))
 

@@ -142,7 +142,7 @@ def _recalibrated(
         changed = then.changes(found.information, columns)
         arm = then.widened(columns, changed)
         found = arm.solved(system)
-        told, named = named, changes.names_of(changed)
+        told, named = named, [each.names for reasons in changed for each in reasons]
         if told == named:
             break
     expected, _ = found.information.mean(root_of(arm.doubted))
