@@ -5,9 +5,8 @@
 Size. Base and tool change neither the angle of a move nor its shift along the axis of the turn
 (screw congruence), so the ratio of the shifts of arm and board is that of their lengths.
 
-Proportions. Printers stretch one side of a page. The residuals at the board, averaged over the
-images, show the ratio of its sides; the arm absorbs the scale of both together, which is as
-uncertain.
+Proportions. Residuals at the board, averaged over the images, show the ratio of its sides; the arm
+absorbs the scale of both together.
 """
 
 from __future__ import annotations

@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rounded joint values: does the arm explain the gain, or the rounding?
 
-Values that are multiples of a step are off by up to half a step, identically wherever a joint has
-the same value. A model can follow that, even on held-out poses with the same values. So an F test
-decides whether the arm explains more of the nominal residuals y, frames projected out, than chance
-would if rounding explained them all,
+docs/model.md (Judgement) gives the reasons. An F test decides whether the arm explains more of the
+nominal residuals y, frames projected out, than chance would if rounding explained them all,
 
     y ~ N(0, k (I + C C^T))        C: a column for each value of each joint, scaled to its error
 """

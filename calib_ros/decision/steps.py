@@ -2,18 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Something moved during the session: one step in time of a base, a tool or a joint's zero.
 
-If none is found and residuals are larger than the noise, these are searched again beyond what the
-arm bends under a constant load at its end, and one of the load and of all zeros at once too.
-
-Each of these adds a group of columns X to the linear model, switched on at some stop. At the fit,
-with J the columns of the parameters and r the residuals, a group explains, of the remaining
-squares,
+docs/model.md (Judgement) describes the search. A step adds a group of columns X to the linear
+model, switched on at some stop. At the fit, with J the columns of the parameters and r the
+residuals, a group explains, of the remaining squares,
 
     e = v^T S^+ v        v = X^T r - A^T H^+ J^T r    S = X^T X - A^T H^+ A    A = J^T X
 
-Products of all columns are summed from the end of the session and serve every stop. Stops a tenth
-of the shorter side apart are tried, then every stop near the best, of up to 400 samples;
-docs/model.md (Judgement) has the rules. Known distances between sockets say nothing about time.
+Products of all columns are summed from the end of the session and serve every stop; docs/model.md
+(Judgement) has the rules of the search. Known distances between sockets say nothing about time.
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fit itself: its parameters, start, priors and noise.
 
-A first fit to some samples, guarded by common-sense priors, comes close. The robust fit to all
-samples follows. If its data yield priors that would change it (`evidence.py`), it is repeated with
-them; with effects, until the noise no longer falls.
+A first fit to some samples comes close. If the robust fit to all yields priors that would change
+it (`evidence.py`), it is repeated with them; with effects, until the noise no longer falls.
 """
 
 from __future__ import annotations

@@ -10,16 +10,9 @@ weights by distance until they converge (Holland and Welsch 1977):
     redescending w = 1 below INNER, 0 beyond OUTER, falling in between (Hampel 1974)
     huber        w = min(1, INNER / distance)              (Huber 1964)
 
-If that finds outliers, or larger residuals than the given sigmas explain, the fit is repeated from
-the best half of the samples: gross errors may agree with each other, and are then a second model.
-
-The best half: least trimmed squares (Rousseeuw 1984), found as in FAST-LTS (Rousseeuw and van
-Driessen 2006). Many fits are made to a few randomly drawn configurations. Concentration steps
-improve each: take the half with the shortest residuals, fit it, repeat. All fits share one
-linearised model and are computed at once as matrix products; the model is linearised again at the
-best fit until its half no longer changes. Half means half of every set, and slightly more: with P
-parameters and R equations (1 + P / R) / 2 of the samples, which tolerates the most gross errors
-(Rousseeuw and Leroy 1987).
+Least trimmed squares finds the best half of the samples, if gross errors may agree with each
+other. Half means half of every set, and slightly more: with P parameters and R equations
+(1 + P / R) / 2 of the samples, which tolerates the most gross errors (Rousseeuw and Leroy 1987).
 """
 
 from __future__ import annotations

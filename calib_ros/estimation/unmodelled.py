@@ -2,19 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of the arm that no parameter explains: how far its joints turn and their axes tilt.
 
-Play, gear harmonics, wobbling bearings and a rocking base act at the joints, so their errors grow
-with the distance of the target from these; the noise of a device does not. That tells them apart
-even if the sigmas of the device are unknown.
-
-Axes that wobble, as in their bearings, tilt by waves (`joint_errors.waved`) of the joint's value.
-Their size s is the most probable one, with the parameters integrated out: with the products W of
-their columns and p of these with the residuals, both beside the parameters, the log evidence is
+docs/model.md (What no parameter explains) gives the reasons. Waves of size s, with the parameters
+integrated out, have the log evidence
 
     (p^T (W + I / s^2)^-1 p - log det(I + s^2 W)) / 2
 
-In a small region parameters absorb waves without a trace in the residuals: unless the data rule
-the typical size out, the largest plausible one counts, at most the typical one or a larger one
-that shows.
+with the products W of their columns and p of these with the residuals, both beside the parameters.
 
 The rest is random, from stop to stop. With the columns Q of the posterior, and of waves that show,
 scaled by a root of the covariance, the residuals r have the covariance B V B + B - B^2, B = I -
@@ -26,9 +19,8 @@ K holds the products, stop by stop, of the columns of turns of all joints about 
 tilts. If a test finds r^T K r larger than white noise allows, sizes v >= 0 equate these forms with
 their expected values (MINQUE, Rao 1971).
 
-Waves move the fitted parameters too, and so do considered effects (`evidence.py`): those of
-columns A and expected squares S add H^-1 (J^T A S A^T J) H^-1 to the covariance. Random errors
-average out like noise.
+Waves and considered effects (`evidence.py`) also move the fitted parameters: those of columns A
+and expected squares S add H^-1 (J^T A S A^T J) H^-1 to the covariance.
 """
 
 from __future__ import annotations

@@ -8,15 +8,10 @@ The parameter difference d is tested by d^T C^-1 d with C = C_1 + C_2; then the 
 are searched for (`changes.py`). The difference of predicted positions, in the best frames, is a
 quadratic form of d; its limit is the quantile for d ~ N(d, C).
 
-Wobble of the axes that the models lack moves the parameters of each, in a small region without a
-trace in the residuals (`unmodelled.py`). It is the same in both, so C has the covariance of the
-difference of its effects: nothing for the same poses, the whole for other regions. The usual
-drift (`age.py`) between both is no change either.
-
-Smooth errors of a moved device (`considered.py`) give differences if other poses were measured.
-Only expected squares of errors include them (`region.py`): a difference that is significant
-without them is reported as such. If a calibration held DH parameters at nominal, its fitted ones
-absorb part of their errors, so its expected squares replace its covariance.
+Wobble that the models lack is the same in both, so C has the covariance of the difference of its
+effects on the parameters (`unmodelled.py`): nothing for the same poses. The usual drift (`age.py`)
+is no change either. Smooth errors of a moved device (`considered.py`) give differences at other
+poses; a difference that is significant only without them is reported as such.
 """
 
 from __future__ import annotations

@@ -4,9 +4,7 @@
 
 The steps of `identify` are those of Vacarescu et al., section 3: measure, linearise the pose
 errors in the parameter errors, solve by least squares, correct the parameters, and repeat until
-the step vanishes. The rest makes the result trustworthy: frames without an initial guess, gauge
-freedoms found and named, and a test on held-out poses. `identify_model` chooses non-geometric
-effects by cross-validation (docs/model.md, Non-geometric errors).
+the step vanishes. The rest makes the result trustworthy (docs/model.md, Judgement).
 """
 
 from __future__ import annotations
