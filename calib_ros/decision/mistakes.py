@@ -392,4 +392,5 @@ def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
     for name in ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented'):
         ordered = np.concatenate([getattr(e, name) for e in parts])[order]
         joined[name] = ordered[reported if name == 'joints' else measured]
-    return Observations(**joined, base=each.base, tool=each.tool, socket=each.socket)
+    kept = {name: getattr(each, name) for name in ('base', 'tool', 'socket', 'inverse')}
+    return Observations(**joined, **kept)

@@ -17,6 +17,7 @@ from calib_ros.decision import mistakes, trials
 from calib_ros.decision.mistakes import explained, explained_alone
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
+from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.settings import LEVER
 
@@ -88,6 +89,18 @@ def test_rows_that_are_not_like_the_others_are_named():
             found.suspects[0].remedy == 'write them as the others (--joint-angle deg reads them)'
         )
         assert found.corrected < 0.01
+
+
+def test_a_few_rows_of_a_camera_on_the_flange_with_other_quaternions_are_named():
+    """As they were measured, before they are inverted."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(2)
+    seen = measure(faulty(arm, Cell(), rng), arm.random_joints(40, rng), rng, 5e-5, 2e-4)
+    given = replace(seen.inverted(), inverse=False)
+    read = se3.from_quat(np.roll(se3.to_quat(given.rotations), 1, axis=1))
+    some = np.isin(np.arange(40), [5, 6, 7])[:, np.newaxis, np.newaxis]
+    spoilt = replace(given, rotations=np.where(some, read, given.rotations)).inverted()
+    found = str(explained(Problem(arm, spoilt)))
+    assert found.startswith('in lines 6 to 8 alone, the quaternions are w x y z, not x y z w')
 
 
 @pytest.mark.parametrize(
