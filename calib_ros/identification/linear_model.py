@@ -27,7 +27,7 @@ from calib_ros.estimation.observations import SOME_POSES, numbered
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, Index
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.progress import Notify, quiet
 
 HARMONICS = range(3, 41)
@@ -40,8 +40,8 @@ are the same within 1e-4 (benchmarks/real_robots.py)."""
 class LinearModel:
     """The linear model about a geometric fit; columns of effects are computed on demand.
 
-    Rows are ordered by folds; the first column is the residual. At sockets no device could drift,
-    so residuals are not shifted in time and no spectrum is searched.
+    The first column is the residual. At sockets no device could drift, so residuals are not
+    shifted in time and no spectrum is searched.
     """
 
     def __init__(self, problem: Problem, geometric: Identification) -> None:
@@ -68,9 +68,7 @@ class LinearModel:
         rows = self._rows(self._names)
         self._ends = np.cumsum([each[-1].size for each in rows])
         owner = owners(rows)
-        dealings = np.array([self._groups % problem.folds, blocks[self._groups]])[:, owner]
-        self._order = np.lexsort(dealings)  # by folds, for products
-        self._folds = dealings[:, self._order]
+        self._folds = np.array([self._groups % problem.folds, blocks[self._groups]])[:, owner]
         *columns, residual = stacked(rows).T
         self._columns = np.zeros((0, len(owner)))
         self._products = [np.zeros((1 + int(each.max(initial=0)), 0, 0)) for each in self._folds]
@@ -193,16 +191,14 @@ class LinearModel:
     def _add(self, columns: FloatArray) -> None:
         """Add columns (K, R) and their products with all, by fold of each dealing."""
         count = len(self._columns)
-        self._columns = np.concatenate([self._columns, np.take(columns, self._order, axis=1)])
+        self._columns = np.concatenate([self._columns, columns])
         grown = (0, 0), (0, len(columns)), (0, len(columns))
         self._products = [np.pad(each, grown) for each in self._products]
-        for cell, folds in _cells(self._folds):
-            old, new = np.split(self._columns[:, cell], [count])
-            own, cross = new @ new.T, old @ new.T
-            for products, fold in zip(self._products, folds, strict=True):
-                products[fold, count:, count:] += own
-                products[fold, :count, count:] += cross
-                products[fold, count:, :count] += cross.T
+        for products, folds in zip(self._products, self._folds, strict=True):
+            for fold, found in enumerate(products):
+                part = self._columns[:, folds == fold]
+                found[count:] = part[count:] @ part.T
+                found[:count, count:] = found[count:, :count].T
 
     def _rows(self, names: Sequence[str]) -> list[FloatArray]:
         added = [name for name in names if name not in self._names]
@@ -232,8 +228,7 @@ class LinearModel:
             factor = linalg.cho_factor(scaled)
             weights[fold, which] = -scale * linalg.cho_solve(factor, scale * left[:, 0])
         fold_of = self._folds[[dealing]]
-        left_out = np.empty(self._columns.shape[1])
-        left_out[self._order] = np.take_along_axis(weights @ self._columns, fold_of, axis=0)[0]
+        left_out = np.take_along_axis(weights @ self._columns, fold_of, axis=0)[0]
         pieces = np.split(left_out, self._ends[:-1])
         sets = self._system.sets
         errors = [s.position_errors(p) for s, p in zip(sets, pieces, strict=True)]
@@ -250,10 +245,3 @@ class LinearModel:
             group = str(size_group(self._chain, name))
             sigmas[name] = max(effects.expected(name), self._sizes.get(group, 0.0))
         return np.array([self._noise / sigmas[n] if n in sigmas else 0.0 for n in names])
-
-
-def _cells(folds: Index) -> Iterator[tuple[slice, list[int]]]:
-    """Yield the runs of rows that share their folds (D, R), and these, for each of D dealings."""
-    begins = np.flatnonzero(np.diff(folds, prepend=-1).any(axis=0))
-    for first, last in itertools.pairwise([*begins.tolist(), folds.shape[1]]):
-        yield slice(first, last), folds[:, first].tolist()
