@@ -21,7 +21,6 @@ from calib_ros.estimation.fitted import Fitted, Simpler
 from calib_ros.estimation.leastsquares import (
     System,
     factor_of,
-    factor_of_some,
     minimise,
     triangular_factor,
 )
@@ -79,7 +78,7 @@ def _excited_names(
         names = identifiability.excited(
             triangular_factor(start, wanted, problem.system(every)), wanted
         )
-    return names, factor_of_some(factor, [k for k, n in enumerate(wanted) if n in names])
+    return names, np.asarray(np.linalg.qr(factor[:, np.isin(wanted, names)], mode='r'))
 
 
 def _fit_all(

@@ -213,13 +213,6 @@ def factor_of(
     return triangular_factor(chain, names, system) if factor is None else factor
 
 
-def factor_of_some(factor: FloatArray, which: Sequence[int]) -> FloatArray:
-    """Return R (K, K) of some columns of a factor R (P, P)."""
-    if len(which) == len(factor):
-        return factor
-    return np.asarray(np.linalg.qr(factor[:, which], mode='r'))
-
-
 def triangular_factor(chain: Chain, names: Sequence[str], system: System) -> FloatArray:
     """Return R (P, P), upper triangular, with R^T R the normal matrix."""
     size = len(names)
@@ -254,7 +247,6 @@ def minimise(
     system: System,
     tolerance: float = STEP_TOLERANCE,
     iterations: int = 1000,
-    normal: Normal | None = None,
 ) -> Fit:
     """Fit the named parameters, relinearising until the step vanishes.
 
@@ -265,9 +257,8 @@ def minimise(
     gain (Nielsen 1999). It has converged when the undamped step vanishes. It ends without
     convergence after ROUNDS iterations without progress (a thousandth of the cost, or half of the
     remaining step), when numbers overflow, or after `iterations`; curved valleys need 400.
-    `normal` are the equations at the start, if known.
     """
-    normal = normal or normal_equations(chain, names, system)
+    normal = normal_equations(chain, names, system)
     if not names:
         return Fit(chain, normal, True)
     best, best_chain = normal, chain

@@ -29,7 +29,6 @@ from calib_ros.estimation.leastsquares import (
     System,
     factor_of,
     minimise,
-    normal_equations,
     triangular_factor,
 )
 from calib_ros.estimation.levels import TELLING
@@ -145,10 +144,8 @@ def _start_one(
             away = norms(residual_arrays(start, subset)[0] - left)
             if np.median(away) <= EXCEPTION * spread:  # the same valley
                 continue
-            normal = normal_equations(start, names, system)
-            chosen = excited(factor_of(start, names, system, normal), names)
-            known = normal if len(chosen) == len(names) else None
-            fitted = minimise(start, chosen, system, tolerance=1e-3, normal=known).chain
+            chosen = excited(factor_of(start, names, system), names)
+            fitted = minimise(start, chosen, system, tolerance=1e-3).chain
             residual = residual_arrays(fitted, subset)[0]
             error = np.median(norms(residual))  # robust
             if error < least:

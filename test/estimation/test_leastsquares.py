@@ -19,7 +19,6 @@ from calib_ros.estimation.leastsquares import (
     Normal,
     Prior,
     System,
-    factor_of_some,
     minimise,
     normal_equations,
     triangular_factor,
@@ -226,8 +225,6 @@ def test_the_factor_is_refused_where_the_normal_matrix_has_lost_its_digits(scale
     assert (factor is None) is (scale < 1.0)
     if factor is not None:
         np.testing.assert_allclose(factor.T @ factor, matrix, rtol=1e-9)
-        some = factor_of_some(factor, [2, 0])
-        np.testing.assert_allclose(some.T @ some, matrix[[2, 0]][:, [2, 0]], rtol=1e-9)
     for value in (np.nan, np.inf, 0.0):
         assert replace(normal, matrix=value * np.eye(3)).factor() is None
 
