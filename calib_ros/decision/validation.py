@@ -77,11 +77,9 @@ def _cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Compariso
         return None, 'nothing: too few poses to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
     numbers = [group % folds for group in groups]
-    order = [np.argsort(each, kind='stable') for each in numbers]  # once for both
-    system, dealt = fitted.system.select(order), [np.sort(each) for each in numbers]
     chains = zip(
-        without_each(before, frames, system, dealt),
-        without_each(fitted.chain, names, system, dealt),
+        without_each(before, frames, fitted.system, numbers),
+        without_each(fitted.chain, names, fitted.system, numbers),
         strict=True,
     )
     first, second = left_out(chains, problem.sets, groups, numbers)
@@ -106,9 +104,7 @@ def left_out(
             out = each.select(np.flatnonzero(numbers == k))
             for side, chain in zip(pieces, pair, strict=True):
                 side.append(residuals(chain, out))
-    order = np.argsort(np.concatenate(folds), kind='stable')
-    index = np.empty_like(order)
-    index[order] = np.arange(len(order))
+    index = np.argsort(np.argsort(np.concatenate(folds), kind='stable'))
     before, after = (joined(side, np.concatenate(groups), index) for side in pieces)
     return before, after
 
