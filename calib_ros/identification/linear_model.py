@@ -194,11 +194,13 @@ class LinearModel:
         self._columns = np.concatenate([self._columns, columns])
         grown = (0, 0), (0, len(columns)), (0, len(columns))
         self._products = [np.pad(each, grown) for each in self._products]
-        for products, folds in zip(self._products, self._folds, strict=True):
-            for fold, found in enumerate(products):
-                part = self._columns[:, folds == fold]
-                found[count:] = part[count:] @ part.T
-                found[:count, count:] = found[count:, :count].T
+        for cell in np.unique(self._folds, axis=1).T:
+            part = self._columns[:, (self._folds == cell[:, np.newaxis]).all(axis=0)]
+            found = part[count:] @ part.T
+            for products, fold in zip(self._products, cell, strict=True):
+                products[fold, count:] += found
+        for products in self._products:
+            products[:, :count, count:] = np.swapaxes(products[:, count:, :count], 1, 2)
 
     def _rows(self, names: Sequence[str]) -> list[FloatArray]:
         added = [name for name in names if name not in self._names]
