@@ -118,10 +118,9 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     forms = _Forms(few, extra)
     limit = special.ndtri(1.0 - (1.0 - CERTAIN) / (len(kinds) * len(forms.parts)))
     alike: dict[int, list[str]] = {}
-    for kind in kinds:
-        links = few.links(kind)
-        for part in forms.parts:
-            correlation, score = forms.test(part, links)
+    links = [few.links(kind) for kind in kinds]
+    for part in forms.parts:
+        for kind, (correlation, score) in zip(kinds, forms.test(part, links), strict=True):
             correlations[kind] = max(correlations[kind], correlation)
             if score > limit:
                 alike.setdefault(part, []).append(kind)
@@ -199,20 +198,25 @@ class _Forms:
         pairs = [(self._residual[part], own) for part, own in matrices.items()]
         return np.concatenate([(r * (own @ r)).sum(axis=(1, 2)) for r, own in pairs])
 
-    def test(self, part: int, links: FloatArray) -> tuple[float, float]:
-        """Return the excess correlation of linked residuals and its score, N(0, 1) for none."""
-        basis, known = self._basis[part], self._known[part]
-        matrices = {part: np.array([np.eye(len(links)), links])}
-        size, form = self._values(matrices).tolist()
-        pairs = float((known * (links @ known)).sum())
+    def test(self, part: int, links: Sequence[FloatArray]) -> list[tuple[float, float]]:
+        """Return excess correlations of residuals by kinds of links, and scores: N(0, 1) for none.
+
+        For links (n, n) of each kind.
+        """
+        basis, known, found = self._basis[part], self._known[part], []
+        matrices = {part: np.array([np.eye(len(known)), *links])}
+        moments, (size, *values) = self._moments(matrices), self._values(matrices).tolist()
         freedom = float(known.sum() - (basis**2).sum())
-        if not (size > 0.0 and pairs > 0.0 and freedom > 1.5):  # one alone has a constant ratio
-            return 0.0, 0.0
-        ratio = -float((basis * np.tensordot(links, basis, 1)).sum()) / freedom
-        along = np.array([-ratio, 1.0])
-        variance = 2.0 * max(float(along @ self._moments(matrices) @ along), 1e-300)
-        excess = form * freedom / size - ratio * freedom
-        return excess / pairs, excess / float(np.sqrt(variance))
+        for k, (each, form) in enumerate(zip(links, values, strict=True), 1):
+            pairs = float((known * (each @ known)).sum())
+            excess, variance = 0.0, 1.0
+            if size > 0.0 and pairs > 0.0 and freedom > 1.5:  # one alone has a constant ratio
+                ratio = -float((basis * np.tensordot(each, basis, 1)).sum()) / freedom
+                along, own = np.array([-ratio, 1.0]), np.ix_([0, k], [0, k])
+                variance = 2.0 * max(float(along @ moments[own] @ along), 1e-300)
+                excess = form * freedom / size - ratio * freedom
+            found.append((excess / max(pairs, 1.0), excess / float(np.sqrt(variance))))
+        return found
 
     def sizes(self, kernels: dict[int, list[tuple[str, float]]]) -> dict[int, FloatArray]:
         """Return, by part, the sizes (1 + K,) of the independent part and each kernel."""
@@ -329,13 +333,14 @@ def _fading(
 
     `before` are the sums up to `first` stops before: none if one stop spans two blocks.
     """
-    from scipy import signal  # slow to import, rarely needed
-
     past, mixed = np.empty_like(before), np.zeros_like(rows)
     for k, (length, size) in enumerate(kernels):
         fade = np.exp(-1.0 / length)
-        start = fade**first * before[k, ..., np.newaxis]
-        sums, _ = signal.lfilter([1.0], [1.0, -fade], rows, zi=start)
-        past[k], mixed = sums[..., -1], mixed + size * sums
+        added = rows.copy()
+        added[..., 0] += fade**first * before[k]
+        faded = np.multiply.outer([1.0, -fade], np.ones(rows.shape[2]))  # y_t - fade y_t-1 = x_t
+        sums = linalg.solve_banded((1, 0), faded, added.reshape(-1, rows.shape[2]).T)
+        past[k] = sums[-1].reshape(before[k].shape)
+        mixed += size * sums.T.reshape(rows.shape)
     cross = rows.reshape(len(rows), -1) @ mixed.reshape(len(rows), -1).T
     return cross + cross.T - sum(size for _, size in kernels) * gram(rows), past
