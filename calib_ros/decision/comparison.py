@@ -135,8 +135,6 @@ class Comparison(Shown):
     @cached_property
     def figures_of_all(self) -> tuple[ErrorFigures, ErrorFigures]:
         """Return the figures before and after with outliers."""
-        if not self.outliers:
-            return self.figures
         return self.before.figures(self.counting), self.after.figures(self.counting)
 
 

@@ -20,6 +20,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from calib_ros.estimation.configurations import group_means
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import SEVERAL
 from calib_ros.estimation.observations import SOME_POSES, Observations
@@ -48,7 +49,7 @@ class Shifts:
         self._stops = []  # of each set, where they begin, and weights of their rows
         for seen in (samples.observations for samples in system.sets):
             begins = np.flatnonzero(np.diff(seen.stops, prepend=-1))
-            self._stops.append((begins, _weights(seen, begins)))
+            self._stops.append((begins, _weights(seen)))
         count = min(SHIFTS, 2 * max(len(begins) for begins, _ in self._stops))
         self._shifted, self._energy = list[FloatArray](), np.zeros(count)
         for stops, residual in zip(self._stops, residuals, strict=True):
@@ -112,23 +113,18 @@ def _by_stop(values: FloatArray, begins: Index, weights: FloatArray) -> FloatArr
     return np.concatenate([summed(each * values, begins) for each in weights], axis=-2)
 
 
-def _weights(observations: Observations, begins: Index) -> FloatArray:
+def _weights(observations: Observations) -> FloatArray:
     """Return the weights (m, N) of the rows of each stop: the inverse root of their number.
 
     Pixels also get their image coordinates as weights, with mean square 1 in each stop: sums
     detect only shifts of the camera, first moments its whole pose.
     """
-    count = np.diff(begins, append=len(observations))
-    number = np.repeat(np.arange(len(begins)), count)
-    root = 1.0 / np.sqrt(count)[number]
+    stops = observations.stops
+    root = 1.0 / np.sqrt(np.bincount(stops))[stops]
     if observations.pixels is None:
         return root[np.newaxis]
-
-    def mean(values: FloatArray) -> FloatArray:
-        return np.asarray((np.add.reduceat(values, begins) / count[:, np.newaxis])[number])
-
-    centred = observations.pixels - mean(observations.pixels)
-    centred /= np.maximum(np.sqrt(mean(centred**2)), 1e-9)  # corners in a line
+    centred = observations.pixels - group_means(observations.pixels, stops)[stops]
+    centred /= np.maximum(np.sqrt(group_means(centred**2, stops)[stops]), 1e-9)  # in a line
     return np.concatenate([root[np.newaxis], root * centred.T])
 
 

@@ -32,6 +32,13 @@ def successive(numbers: Index) -> Index:
     return np.asarray((np.cumsum(np.bincount(numbers) > 0) - 1)[numbers])
 
 
+def group_means(rows: FloatArray, numbers: Index) -> FloatArray:
+    """Return the means (M, ...) of rows (N, ...) over groups of successive numbers (N,)."""
+    begins = np.flatnonzero(np.diff(numbers, prepend=-1))
+    counts = np.diff(begins, append=len(numbers)).reshape(-1, *[1] * (rows.ndim - 1))
+    return np.asarray(np.add.reduceat(rows, begins) / counts)
+
+
 def stops(joints: FloatArray) -> Index:
     """Return the stop number (N,) of consecutive joint values (N, n)."""
     moved = np.zeros(len(joints), dtype=np.intp)

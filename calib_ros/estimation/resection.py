@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.errors import InputError
+from calib_ros.estimation.configurations import group_means
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import NEARER
 from calib_ros.estimation.observations import Observations
@@ -48,19 +49,12 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
     return seen.inverted() if observations.on_flange else seen
 
 
-def _per_image(rows: FloatArray, index: Index) -> FloatArray:
-    """Return the means (M, ...) of rows (N, ...) over each image."""
-    begins = np.flatnonzero(np.diff(index, prepend=-1))
-    counts = np.diff(begins, append=len(index)).reshape(-1, *[1] * (rows.ndim - 1))
-    return np.asarray(np.add.reduceat(rows, begins) / counts)
-
-
 def _require_fit(observations: Observations, rms: FloatArray) -> None:
     """Raise unless poses of the board explain the points in most images."""
     assert observations.pixels is not None
     index, pixels = observations.images, observations.pixels
-    beside_the_centre = pixels - _per_image(pixels, index)[index]
-    spread = np.sqrt(_per_image((beside_the_centre**2).sum(axis=1), index))
+    beside_the_centre = pixels - group_means(pixels, index)[index]
+    spread = np.sqrt(group_means((beside_the_centre**2).sum(axis=1), index))
     beside = ~(rms < NEARER * spread)
     if 2 * beside.sum() > len(rms):
         raise InputError(
@@ -134,8 +128,8 @@ def _determine_a_pose(observations: Observations) -> Flags:
     index = observations.images
     usable = np.bincount(index) >= 4
     for places in (observations.points, observations.pixels):
-        rest = places - _per_image(places, index)[index]
-        squares = _per_image(rest[:, :, np.newaxis] * rest[:, np.newaxis], index)
+        rest = places - group_means(places, index)[index]
+        squares = group_means(rest[:, :, np.newaxis] * rest[:, np.newaxis], index)
         spread = np.linalg.eigvalsh(squares)
         usable &= spread[:, -2] > DEGENERATE**2 * spread[:, -1]
     return np.asarray(usable)
@@ -145,9 +139,9 @@ def _from_homography(plane: FloatArray, rays: FloatArray, index: Index) -> Float
     """Return poses (M, 4, 4) from points (N, 2) [m] of the plane and rays (N, 2)."""
     begins = np.flatnonzero(np.diff(index, prepend=-1))
     scale = np.sqrt((plane**2).sum(axis=1).mean())
-    centre = _per_image(rays, index)
+    centre = group_means(rays, index)
     near = rays - centre[index]
-    size = np.sqrt(_per_image((near**2).sum(axis=1, keepdims=True), index))
+    size = np.sqrt(group_means((near**2).sum(axis=1, keepdims=True), index))
     near = near / size[index]
     point = np.ones((3, len(plane)))
     point[:2] = plane.T / scale

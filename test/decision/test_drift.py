@@ -195,8 +195,7 @@ def test_corners_of_an_image_move_with_their_first_moments():
     rng = np.random.default_rng(0)
     pixels = rng.normal(size=(7, 2)) * [300.0, 200.0] + [640.0, 480.0]
     pixels[3:, 1] = 100.0  # a line
-    begins, counts = np.array([0, 3]), np.array([3, 4])
-    found = drift_module._weights(Stops(np.repeat([0, 1], counts), pixels), begins)
+    found = drift_module._weights(Stops(np.repeat([0, 1], [3, 4]), pixels))
     assert found.shape == (3, 7)
     for part, count in ((slice(0, 3), 3), (slice(3, 7), 4)):
         np.testing.assert_allclose(found[0, part], count**-0.5)
