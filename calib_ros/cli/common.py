@@ -49,8 +49,17 @@ LAYOUT_OPTIONS = (
 """Options of foreign tables."""
 OF_TABLES = (
     *('session', 'eye_in_hand', 'sigma_touch', 'preset', 'columns', 'joints', *LAYOUT_OPTIONS),
-    *('detections', 'board', 'places', 'intrinsics', 'lens'),
+    *('detections', 'board', 'places', 'intrinsics', 'lens', 'joints_preset'),
 )
+
+NEEDS = {
+    '--previous': ('growth', 'new_base', 'new_tool'),
+    '--detections': ('board', 'places', 'intrinsics', 'lens'),
+    '--joints': ('joints_preset',),
+    '--tracker': ('axis', 'cone'),
+    '--out': ('pdf',),
+}
+"""Options that do nothing without another one."""
 
 
 class Status(IntEnum):
@@ -61,14 +70,28 @@ class Status(IntEnum):
     """Of a fleet: some measurements or results could not be used, and no robot needs a look."""
 
 
+def refuse(options: argparse.Namespace, names: Iterable[str], why: str) -> None:
+    """Refuse options that are not at their default, and tell why."""
+    for name in names:
+        if vars(options).get(name) != options.parser.get_default(name):
+            raise InputError(f'--{name.replace("_", "-")} {why}')
+
+
+def refuse_alone(options: argparse.Namespace) -> None:
+    """Refuse options without the one that they need."""
+    for needed, names in NEEDS.items():
+        if vars(options).get(needed[2:], '') is None:
+            refuse(options, names, f'needs {needed}')
+
+
 def refuse_ignored(options: argparse.Namespace, source: str) -> None:
     """Refuse options that a bag, or a table, would ignore."""
-    of_bags = (*SETTINGS['bags: what is read'], 'frame_id')
-    for name in of_bags if source == 'table' else OF_TABLES:
-        if vars(options).get(name):
-            instead = ': add eye_in_hand=true to its --sources' if name == 'eye_in_hand' else ''
-            option = f'--{name.replace("_", "-")}'
-            raise InputError(f'{option} does not apply to a {source}{instead}')
+    if source == 'table':
+        refuse(options, (*SETTINGS['bags: what is read'], 'frame_id'), 'does not apply to a table')
+    else:
+        instead = 'does not apply to a bag: add eye_in_hand=true to its --sources'
+        refuse(options, ('eye_in_hand',), instead)
+        refuse(options, OF_TABLES, 'does not apply to a bag')
 
 
 def complete_robots(prefix: str, **_: Any) -> list[str]:

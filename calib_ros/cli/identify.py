@@ -54,7 +54,6 @@ from calib_ros.texts import dump_json
 PAGES = ('report.html', 'report.md', 'residuals.csv', 'before_after.png')
 RESULT_FILES = ('calibration.yaml', 'result.json', 'settings.yaml', *PAGES)
 REPORTS = (*PAGES, 'report.pdf')
-OF_UPDATES = ('new_base', 'new_tool')
 NOT_OF_UPDATES = ('history', 'tolerance', 'pdf', 'model', 'fixed', 'priors')
 
 
@@ -63,12 +62,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         raise InputError(f'--tolerance must be positive, not {options.tolerance}')
     if not 0.0 <= options.largest_loss <= 1.0:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
-    update = options.previous is not None
-    for name in NOT_OF_UPDATES if update else OF_UPDATES:
-        if (value := getattr(options, name)) and value != getattr(Settings, name, None):
-            does = 'does not apply to' if update else 'needs'
-            raise InputError(f'--{name.replace("_", "-")} {does} --previous')
-    if update:
+    if options.previous is not None:
+        common.refuse(options, NOT_OF_UPDATES, 'does not apply to --previous')
         return _recalibrated(options, screen)
     filed = inputs.history_of(options)
     with common.output_files(options, (*RESULT_FILES, 'report.pdf')) as contents:

@@ -52,8 +52,6 @@ def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | No
     if not (any(given.values()) or options.preset or options.columns or options.joints):
         return None
     given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])
-    if options.joints_preset and options.joints is None:
-        raise InputError('--joints-preset needs --joints FILE')
     units = {name: given[name] for name in ('length', 'angle', 'joint_angle')}
     log = layout_of(options.joints_preset, options.columns, {} if options.joints_preset else units)
     layout = layout_of(options.preset, options.columns, given)
@@ -90,7 +88,7 @@ def filing_of(
     if all(unread.values()) and unread == _files(unread):
         read = [each.sha256 for each in inputs_of(*unread)]
         changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
-    for name in (*OF_TABLES[1:], 'joints_preset'):  # a session is told apart anyway
+    for name in OF_TABLES[1:]:  # a session is told apart anyway
         value = vars(options).get(name)  # the same table in other units is another result
         read += [f'{name} {value}'] if value and not isinstance(value, Path) else []
     session = options.session or ''

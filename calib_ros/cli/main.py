@@ -29,6 +29,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
 from calib_ros.cli.commands import COMMANDS, add_options
+from calib_ros.cli.common import refuse_alone
 from calib_ros.cli.screen import Screen, fitted, help_width, wrapped
 from calib_ros.errors import CalibrationError, UnknownNameError, near, shortened, trouble
 
@@ -54,6 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _options(given)
         typed = shlex.join(('calib_ros', *given))
         options.typed = re.sub('://[^/@]*@', '://', typed)  # no password
+        refuse_alone(options)
         module, function = options.home.split('.')
         run = getattr(importlib.import_module(f'calib_ros.cli.{module}'), function)
         screen = Screen(options.quiet)

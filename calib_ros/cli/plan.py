@@ -29,6 +29,7 @@ from calib_ros.report.applied import plan_report
 TESTS = 'P1 to P5 of ISO 9283 in a cube of {:.3f} m, in {}; collisions are not checked'
 VISIT = 'visit P1 to P5 in turn, 30 times, and measure each time'
 WITH_TURNS = 'orientations are measured too (of a reflector alone: --measured position)'
+NOT_OF_TESTS = ('poses', 'accuracy', 'candidates', 'task', 'taken')
 ORIENTED = 'various orientations', 'one orientation'
 
 
@@ -112,9 +113,8 @@ def _measurement(
 
 
 def _check(options: argparse.Namespace) -> None:
-    for name in ('poses', 'accuracy', 'candidates', 'task', 'taken'):
-        if options.iso9283 and getattr(options, name) is not None:
-            raise InputError(f'--{name} does not apply to --iso9283')
+    if options.iso9283:
+        common.refuse(options, NOT_OF_TESTS, 'does not apply to --iso9283')
     common.at_least(options, poses=1, draw=1, seed=0, apart=0)
     if options.accuracy is not None and not options.accuracy > 0.0:
         raise InputError(f'--accuracy must be positive, not {options.accuracy}')

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.atomic import write_file
+from calib_ros.cli import common
 from calib_ros.cli.screen import Screen
-from calib_ros.errors import InputError
 from calib_ros.kinematics.chain_file import (
     URDF_SUFFIXES,
     chain_document,
@@ -48,9 +48,8 @@ def _chain(options: argparse.Namespace, screen: Screen) -> int:
         text += '# or the tip link itself. Without it that frame is found from the poses.\n'
         for key in ('base', 'tool'):
             text += f'# {key}: {json.dumps(frames[key] | {"fixed": True})}\n'
-    elif given:
-        raise InputError(f'--{next(iter(given)).replace("_", "-")} applies only to a URDF')
     else:
+        common.refuse(options, names, 'applies only to a URDF')
         text = dump_chain(load_chain(options.robot))
     if options.out is None:
         screen.data(text.rstrip('\n'))

@@ -23,10 +23,13 @@ from calib_ros.shown import rounded
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
 PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
+OF_PLACEMENT = ('region', 'aim', 'model', 'cells', 'turns')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     common.at_least(options, poses=100, cells=1, turns=1, seed=0)
+    if options.task is None and options.joint_box is None:
+        common.refuse(options, OF_PLACEMENT, 'needs --task or --joint-box')
     with common.output_files(options, WORKSPACE_FILES + PLACEMENT_FILES) as contents:
         contents |= _files(options, screen)
     screen.say(common.written(options.out, contents))

@@ -41,6 +41,16 @@ def bad_inputs():
         yield f'tolerance {wrong}', (*good, '--tolerance', wrong), '--tolerance must be positive'
     yield ('useless option', (*good, '--sources', '/pose'), '--sources does not apply to a table')
     yield 'new base', (*good, '--new-base'), '--new-base needs --previous'
+    yield 'growth', (*good, '--growth', '30'), '--growth needs --previous'
+    for alone in (('--board', 'b'), ('--places', 'p'), ('--intrinsics', 'i'), ('--lens', 'given')):
+        yield f'{alone[0]} alone', (*good, *alone), f'{alone[0]} needs --detections'
+    yield 'a layout of nothing', (*good, '--joints-preset', 'kuka'), ' needs --joints'
+    of_bag = (*bag_of, 'folder', '--joints-preset', 'kuka')
+    yield 'a layout of nothing, beside a bag', of_bag, '--joints-preset needs --joints'
+    yield 'a certificate nowhere', (*good, '--pdf'), '--pdf needs --out'
+    yield 'a cone to nothing', ('plan', '--chain', 'ur5e', '--cone', '30'), 'needs --tracker'
+    nothing = ('workspace', 'r', '--chain', 'ur5e', '--out', 'map', '--aim', 'worst')
+    yield 'nothing to place', nothing, '--aim needs --task or --joint-box'
     for useless in (('--history', 'h'), ('--model', 'auto')):
         given = (*good, *useless, '--previous', 'r')
         yield f'useless {useless[0]}', given, f'{useless[0]} does not apply to --previous'
