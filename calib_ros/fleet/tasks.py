@@ -13,18 +13,11 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from calib_ros.errors import CalibrationError, ConfigError, shortened
+from calib_ros.errors import CalibrationError, ConfigError, InputError, shortened
+from calib_ros.files import rows
 from calib_ros.files.bags import replay
 from calib_ros.files.history import is_local
 from calib_ros.files.loading import TABLES, of_bag, of_table, table
-from calib_ros.files.rows import (
-    Filing,
-    Row,
-    content_hash,
-    digest,
-    identified,
-    inputs_of,
-)
 from calib_ros.files.unpacked import RECORDED
 from calib_ros.fleet.plant import Robot
 from calib_ros.identification.age import measured_at
@@ -69,7 +62,7 @@ class Task:
 class Outcome(NamedTuple):
     """The outcome of a task: a row, an error, or the source with the same content."""
 
-    row: Row | None = None
+    row: rows.Row | None = None
     error: str = ''
     known: str = ''
     page: str = ''
@@ -78,27 +71,30 @@ class Outcome(NamedTuple):
 
 def sources(robot: Robot) -> tuple[tuple[SourceFile, ...], dict[str, str]]:
     """Return the sources of a robot, and errors by pattern."""
-    found, wrong = [], {}
+    found: list[SourceFile] = []
+    wrong = {}
     for each in robot.measured:
         try:
-            files, pattern = _file_system(each.files)
-            matched = files.glob(pattern, detail=True)
-            hidden = _hidden(pattern)  # copies are, until they are whole, and what is half written
-            matched = {path: matched[path] for path in matched if _hidden(path) == hidden}
+            found += _matching(each.files, each.session)
         except CalibrationError as err:
             wrong[each.files] = str(err)
-            continue
         except Exception as err:  # file systems have their own errors
             wrong[each.files] = f'{each.files} cannot be listed: {err}'
-            continue
-        if not matched:
-            wrong[each.files] = f'nothing matches {each.files}'
-        for path, info in sorted(matched.items()):
-            fingerprint, modified = _state(files, path, info)
-            url = path if is_local(files) else files.unstrip_protocol(path)
-            url += each.files[each.files.find('::') :] if '::' in each.files else ''
-            found.append(SourceFile(url, each.session, fingerprint, modified))
     return tuple(found), wrong
+
+
+def _matching(url: str, session: str) -> list[SourceFile]:
+    files, pattern = _file_system(url)
+    hidden = _hidden(pattern)  # copies are, until they are whole, and what is half written
+    found = []
+    for path, info in sorted(files.glob(pattern, detail=True).items()):
+        if _hidden(path) == hidden:
+            name = path if is_local(files) else files.unstrip_protocol(path)
+            name += url[url.find('::') :] if '::' in url else ''
+            found.append(SourceFile(name, session, *_state(files, path, info)))
+    if not found:
+        raise InputError(f'nothing matches {url}')
+    return found
 
 
 def work(task: Task) -> Outcome:
@@ -115,8 +111,8 @@ def work(task: Task) -> Outcome:
 def _outcome(task: Task) -> Outcome:
     robot, source = task.robot, task.source
     with fetched(source.url) as path:
-        inputs = inputs_of(path)
-        content = content_hash([each.sha256 for each in inputs], source.session)
+        inputs = rows.inputs_of(path)
+        content = rows.content_hash([each.sha256 for each in inputs], source.session)
         if content in task.known:
             return Outcome(known=task.known[content])
         chain, settings = robot.chain, robot.settings
@@ -129,8 +125,8 @@ def _outcome(task: Task) -> Outcome:
         problem, result = loaded.problem, loaded.identified(settings.model)
         time_of = measured_at(problem.all_sets, source.modified)
         known = (content, robot.settings_hash, source.name, source.fingerprint)
-        about = Filing(robot.serial, time_of, *known)
-        row = identified(result, about, loaded.warnings)
+        about = rows.Filing(robot.serial, time_of, *known)
+        row = rows.identified(result, about, loaded.warnings)
         if not task.page:
             return Outcome(row)
         configuration = configuration_yaml(chain.name, settings)
@@ -191,7 +187,7 @@ def _state(files: Any, path: str, info: dict[str, Any]) -> tuple[str, datetime |
             return '', None
         marks.append([name, part['size'], *map(str, dates + sums)])
         times += [each for each in map(_moment, dates) if each is not None]
-    return digest(marks), max(times, default=None)
+    return rows.digest(marks), max(times, default=None)
 
 
 def _moment(value: object) -> datetime | None:

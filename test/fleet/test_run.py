@@ -8,6 +8,7 @@ from unittest.mock import ANY
 import plants
 import pytest
 from distributed import LocalCluster
+from fsspec.implementations.local import LocalFileSystem
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.history import History
@@ -249,6 +250,23 @@ def test_hidden_files_are_no_nights(plant, tmp_path):
         assert wrong == {}
     (own,), _ = sources(replace(plant[0], measured=(Pattern(str(nights / '.002.csv')),)))
     assert own.name == str(nights / '.002.csv')
+
+
+def test_a_store_that_fails_costs_its_pattern_only(plant, tmp_path, monkeypatch):
+    (tmp_path / 'nights/A/bag').mkdir()
+    known = LocalFileSystem.isdir
+
+    def isdir(files, path):
+        if path.endswith('/bag'):
+            raise ValueError('throttled')
+        return known(files, path)
+
+    monkeypatch.setattr(LocalFileSystem, 'isdir', isdir)
+    pattern = str(tmp_path / 'nights/A/*')
+    robot = replace(plant[0], measured=(Pattern(pattern), *plant[0].measured))
+    found, wrong = sources(robot)
+    assert wrong == {pattern: f'{pattern} cannot be listed: throttled'}
+    assert found == sources(plant[0])[0]
 
 
 def test_what_is_damaged_costs_its_robot_only(plant, cluster, tmp_path):
