@@ -32,20 +32,10 @@ from calib_ros.identification.recalibration import recalibrate
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of
-from calib_ros.report import documents, words
+from calib_ros.report import documents, reports, words
 from calib_ros.report.advice import BRINGS, FAR, Advice
 from calib_ros.report.page import Origin, markdown
 from calib_ros.report.poses import poses_of
-from calib_ros.report.reports import (
-    BRING,
-    CLOSER,
-    NOT_YET,
-    advice_of,
-    doubts,
-    identification_report,
-    may_be_closer,
-    result_standing,
-)
 from calib_ros.sampling.dataset import with_lenses
 from calib_ros.settings import Settings
 from calib_ros.shown import of_them, rounded
@@ -54,6 +44,7 @@ from calib_ros.texts import dump_json
 PAGES = ('report.html', 'report.md', 'residuals.csv', 'before_after.png')
 RESULT_FILES = ('calibration.yaml', 'result.json', 'settings.yaml', *PAGES)
 REPORTS = (*PAGES, 'report.pdf')
+UNCHANGED = f'{reports.NOT_YET}: {reports.BRING}'
 NOT_OF_UPDATES = ('history', 'tolerance', 'pdf', 'model', 'fixed', 'priors')
 
 
@@ -150,7 +141,7 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
         for reasons in found.changed:
             screen.bullet(perhaps + reason_in_words(reasons))
     if found.accepted:
-        screen.bullet(f'{NOT_YET}: {BRING}')
+        screen.bullet(UNCHANGED)
 
 
 def _intervals(judged: Comparison | None) -> str:
@@ -265,8 +256,8 @@ def show(found: Identified, screen: Screen) -> None:
     result = found.result
     if found.loaded.read:
         screen.say(found.loaded.read)
-    reasons = advice_of(result)
-    verdict = result_standing(result, reasons, found.wanted)
+    reasons = reports.advice_of(result)
+    verdict = reports.result_standing(result, reasons, found.wanted)
     screen.title(verdict.heading, GOOD_OR_BAD.get(verdict.state))
     screen.table(_rows(result))
     _explain(result, reasons, screen)
@@ -277,8 +268,8 @@ def show(found: Identified, screen: Screen) -> None:
 def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) -> None:
     if result.accepted:
         drift = words.drift_in_words(result.noise)
-        closer = CLOSER if may_be_closer(result) else ''
-        notes = *doubts(result), drift, *words.notes(result), closer, f'{NOT_YET}: {BRING}'
+        closer = reports.CLOSER if reports.may_be_closer(result) else ''
+        notes = *reports.doubts(result), drift, *words.notes(result), closer, UNCHANGED
         for note in notes:
             if note:
                 screen.bullet(note)
@@ -347,7 +338,7 @@ def result_files(
         contents['before_after.png'] = before_after_png(result)
         work('report.html, 3 of 3')
         work(2 / 3)
-        report = identification_report(
+        report = reports.identification_report(
             loaded.problem, result, poses, found.origin, loaded.warnings, found.wanted
         )
         contents['report.md'] = markdown(report, loaded.samples)

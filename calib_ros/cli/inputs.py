@@ -15,19 +15,11 @@ from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files import loading
+from calib_ros.files import loading, rows
 from calib_ros.files.bags import Replayed, replay
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.history import History
 from calib_ros.files.layouts import Layout, layout_of
-from calib_ros.files.rows import (
-    Filing,
-    content_hash,
-    files_of,
-    inputs_of,
-    samples_hash,
-    settings_hash,
-)
 from calib_ros.identification.age import measured_at
 from calib_ros.identification.calibration import Calibration, load_calibration
 from calib_ros.kinematics.chain import Chain
@@ -42,7 +34,7 @@ Unread: TypeAlias = dict[Path, list[tuple[str, int, int]]]
 
 def _files(paths: Iterable[Path]) -> Unread:
     """Return the files at some paths as they are now; those of a pipe are none."""
-    now = {path: [(str(file), file.stat()) for file in files_of(path)] for path in paths}
+    now = {path: [(str(file), file.stat()) for file in rows.files_of(path)] for path in paths}
     return {path: [(f, s.st_size, s.st_mtime_ns) for f, s in each] for path, each in now.items()}
 
 
@@ -81,20 +73,21 @@ def filing_of(
     sets: Sequence[Observations],
     unread: Unread,
     *judged_by: object,
-) -> Filing:
+) -> rows.Filing:
     """Return what is filed with a result: by its files, or by the samples where these changed."""
-    settings, (measured, *_) = settings_hash(nominal, settings_of(options), *judged_by), unread
-    read, changed = [samples_hash(sets)], None
+    settings = rows.settings_hash(nominal, settings_of(options), *judged_by)
+    measured, *_ = unread
+    read, changed = [rows.samples_hash(sets)], None
     if all(unread.values()) and unread == _files(unread):
-        read = [each.sha256 for each in inputs_of(*unread)]
+        read = [each.sha256 for each in rows.inputs_of(*unread)]
         changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
     for name in OF_TABLES[1:]:  # a session is told apart anyway
         value = vars(options).get(name)  # the same table in other units is another result
         read += [f'{name} {value}'] if value and not isinstance(value, Path) else []
     session = options.session or ''
     source = f'{measured}#{session}' if session else str(measured)
-    content = content_hash(read, session)
-    return Filing(options.serial, measured_at(sets, changed), content, settings, source)
+    content = rows.content_hash(read, session)
+    return rows.Filing(options.serial, measured_at(sets, changed), content, settings, source)
 
 
 def origin_of(
@@ -105,7 +98,7 @@ def origin_of(
     known = (*inputs, chain if chain.is_file() else None)
     told = ('operator', 'serial', 'device', 'conditions')
     people = {name: getattr(options, name, '') for name in told}
-    return page.Origin(inputs_of(*known), settings=settings, command=options.typed, **people)
+    return page.Origin(rows.inputs_of(*known), settings=settings, command=options.typed, **people)
 
 
 def page_of(

@@ -154,7 +154,6 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         added = names.add_parser(
             name,
             add_help=False,
-            usage=_usage(name, command.options),
             description=textwrap.fill(f'{text[0].upper()}{text[1:]}.', help_width()),
             epilog='\n'.join(['examples:', *map(_example, command.examples)]),
             formatter_class=partial(
@@ -166,6 +165,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         added.set_defaults(home=command.home, parser=added)
         added._negative_number_matcher = re.compile(r'-\.?\d')  # -1e-5 too, as in Python 3.14
         add_options(added, command.options)
+        added.usage = _usage(added)
         add_more = added.add_argument_group('output').add_argument
         text = 'print only warnings, errors and the output asked for'
         add_more('--quiet', action='store_true', help=text)
@@ -180,16 +180,14 @@ def _example(words: str) -> str:
     return ('  ' + ' \\\n      '.join(parts)).replace('\xa0', ' ')
 
 
-def _usage(name: str, options: Sequence[str]) -> str:
+def _usage(parser: argparse.ArgumentParser) -> str:
     """Return what is required; the rest are options."""
-    words = [f'usage: calib_ros {name}']
-    for line in (each[2:] for each in options if each.startswith('  ')):
-        option, _, form = line.partition('  ')[0].partition(' ')
-        placeholder = form.rstrip('?')
-        if option.endswith('!'):
-            words.append(f'{option[:-1]} {placeholder}')
-        elif placeholder and not option.startswith('--'):
-            words.append(placeholder if placeholder == form else f'[{placeholder}]')
+    words = ['usage:', parser.prog]
+    for each in parser._actions:
+        words += each.option_strings if each.required else ()
+        if each.required or not each.option_strings:
+            form = str(each.metavar or '|'.join(each.choices or ()))
+            words.append(form if each.required else f'[{form}]')
     text = ' '.join([*words, '[options]'])
     return textwrap.fill(text, help_width(), subsequent_indent='    ').removeprefix('usage: ')
 

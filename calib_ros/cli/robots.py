@@ -14,20 +14,13 @@ import numpy as np
 from calib_ros.atomic import write_file
 from calib_ros.cli import common
 from calib_ros.cli.screen import Screen
-from calib_ros.kinematics.chain_file import (
-    URDF_SUFFIXES,
-    chain_document,
-    dump_chain,
-    load_chain,
-    read_urdf,
-    shipped_robots,
-)
+from calib_ros.kinematics import chain_file
 
 
 def _robots(options: argparse.Namespace, screen: Screen) -> int:
     lines = [f'{"--chain":21}{"joints":>6}  {"DH table":10}{"length":>8}']
-    for name in shipped_robots():
-        chain = load_chain(name)
+    for name in chain_file.shipped_robots():
+        chain = chain_file.load_chain(name)
         length = sum(np.hypot(joint.a, joint.d) for joint in chain.joints)
         lines.append(f'{name:21}{len(chain.joints):6}  {chain.convention:10}{length:6.2f} m')
     screen.data('\n'.join(lines))
@@ -40,17 +33,17 @@ def _chain(options: argparse.Namespace, screen: Screen) -> int:
     names = ('base_link', 'tip_link', 'convention')
     given = {name: getattr(options, name) for name in names if getattr(options, name)}
     path = Path(options.robot)
-    if path.suffix in URDF_SUFFIXES:
-        chain = read_urdf(path, **given)
-        frames = chain_document(chain)
-        text = dump_chain(replace(chain, base=None, tool=None))
+    if path.suffix in chain_file.URDF_SUFFIXES:
+        chain = chain_file.read_urdf(path, **given)
+        frames = chain_file.chain_document(chain)
+        text = chain_file.dump_chain(replace(chain, base=None, tool=None))
         text += '# Known in the URDF: take a line in where the device measures in the base link,\n'
         text += '# or the tip link itself. Without it that frame is found from the poses.\n'
         for key in ('base', 'tool'):
             text += f'# {key}: {json.dumps(frames[key] | {"fixed": True})}\n'
     else:
         common.refuse(options, names, 'applies only to a URDF')
-        text = dump_chain(load_chain(options.robot))
+        text = chain_file.dump_chain(chain_file.load_chain(options.robot))
     if options.out is None:
         screen.data(text.rstrip('\n'))
     else:

@@ -21,17 +21,10 @@ from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
+from calib_ros.report import verdicts
 from calib_ros.report.documents import verification_document
 from calib_ros.report.page import markdown
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verdicts import (
-    each_in_words,
-    likely,
-    not_steps,
-    remarks,
-    standing,
-    verification_report,
-)
 from calib_ros.report.words import change
 from calib_ros.sampling.dataset import dataset_of
 from calib_ros.shown import rounded
@@ -80,7 +73,7 @@ def _verified(
         screen.data(dump_json(verification_document(found)))
     else:
         show(found, screen)
-    passed = standing(found)[0].state not in ('bad', 'open')
+    passed = verdicts.standing(found)[0].state not in ('bad', 'open')
     status = 0 if passed else common.Status.NOT_ACCEPTED
     if options.out is None:
         return status, file
@@ -88,7 +81,7 @@ def _verified(
     with screen.work('writing the report') as work:
         poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
         origin = replace(inputs.origin_of(options, read), serial=serial)
-        report = verification_report(arm.chain, found, poses, origin, warnings)
+        report = verdicts.verification_report(arm.chain, found, poses, origin, warnings)
         contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
         contents['report.md'] = markdown(report, {})
         contents |= inputs.page_of(report, screen, pdf=options.pdf)
@@ -106,7 +99,7 @@ def show(found: Verification, screen: Screen) -> None:
     else:
         limit = f'RMS {rounded(1e3 * found.limit)} mm: at most {ALIKE:g} times the expected error'
         limit += ' (--tolerance MM: your own)'
-    state, steps = standing(found)
+    state, steps = verdicts.standing(found)
     screen.title(state.heading, GOOD_OR_BAD.get(state.state))
     screen.table(
         {
@@ -114,14 +107,14 @@ def show(found: Verification, screen: Screen) -> None:
             'position error': change((before, after)),
             'largest': f'{rounded(before.max_mm)} -> {rounded(after.max_mm)} mm',
             'orientation error': change((before, after), 'mrad') or 'not measured',
-            'poses like these': f'RMS {likely(found)}',
+            'poses like these': f'RMS {verdicts.likely(found)}',
             'tolerance': tolerance,
             'limit': limit,
         }
     )
     if found.each:
-        screen.say('\n'.join(['position error [mm] by pose', *each_in_words(found)]))
-    said = not_steps(remarks(found), steps)
+        screen.say('\n'.join(['position error [mm] by pose', *verdicts.each_in_words(found)]))
+    said = verdicts.not_steps(verdicts.remarks(found), steps)
     screen.reasons += said
     for remark in said:
         screen.bullet(remark)

@@ -373,7 +373,7 @@ def test_what_goes_wrong_below_is_one_line_with_advice(shown, monkeypatch, error
     def fail(*_):
         raise error
 
-    monkeypatch.setattr('calib_ros.cli.robots.load_chain', fail)
+    monkeypatch.setattr('calib_ros.kinematics.chain_file.load_chain', fail)
     found, text = shown('chain', 'ur5e')
     assert found == status
     assert words in text
