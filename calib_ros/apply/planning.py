@@ -35,12 +35,12 @@ from calib_ros.apply.design import (
     times,
     triangular,
 )
-from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.identifiability import independent, indices_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 from calib_ros.progress import Notify, quiet
-from calib_ros.settings import CRITERIA, Criterion
+from calib_ros.settings import Criterion
 from calib_ros.shown import Shown, as_frame
 
 INDICES: tuple[Criterion, ...] = ('o2', 'o3', 'o4', 'o5')
@@ -64,8 +64,6 @@ def choose(
     least `apart` [rad or m] in the joint that moves most. Exchanges start at `start`, indices
     (count,), if known; a quick choice skips them.
     """
-    if count < 1:
-        raise ConfigError(f'at least one pose must be chosen, not {count}')
     space = Candidates(design, candidates)
     worth = _Worth(space, criterion, task)
     first = worth if criterion == 'task' else _Worth(space, 'd')
@@ -148,8 +146,6 @@ class _Worth:
     def __init__(
         self, space: Candidates, criterion: Criterion, task: FloatArray | None = None
     ) -> None:
-        if criterion not in CRITERIA:
-            raise UnknownNameError('criterion', criterion, CRITERIA)
         self._criterion, self._space, self._wanted = criterion, space, None
         if criterion == 'task':
             if task is None:

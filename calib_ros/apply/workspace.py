@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import STILL
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import inverse, se3
@@ -23,7 +23,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.follower import mobility
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.progress import Notify, quiet
-from calib_ros.settings import AIMS, EXACT, LEVER, LEVER_IN_PART, TURN_IN_PART, Model, Objective
+from calib_ros.settings import EXACT, LEVER, LEVER_IN_PART, TURN_IN_PART, Model, Objective
 from calib_ros.shown import Shown
 
 
@@ -227,8 +227,6 @@ class _Search:
     def __init__(
         self, arm: Calibration, task: FloatArray, aim: Objective, model: Model, progress: Notify
     ) -> None:
-        if aim not in AIMS:
-            raise UnknownNameError('aim', aim, AIMS)
         self._arm, self._task, self._aim, self._model = arm, task, aim, model
         self._starts, self._progress, self._solved = 24, progress, 0
         self._chain = arm.commanded_by(model)
