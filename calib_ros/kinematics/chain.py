@@ -112,7 +112,7 @@ class Chain(Shown):
         for name in names:
             if names.count(name) > 1:
                 raise ConfigError(f'chain "{self.name}" has two joints named "{name}"')
-            if name in ('base', 'tool'):
+            if name in self.all_frames:
                 raise ConfigError(f'a joint must not be named "{name}", the name of a frame')
         if self.parallel is None:
             object.__setattr__(self, 'parallel', self._joining(nearly_parallel))

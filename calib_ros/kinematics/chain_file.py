@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -44,6 +45,7 @@ CHAIN_KEYS = (
     *('name', 'convention', 'joints', 'parallel', 'base', 'tool', 'frames', 'effects', 'gravity'),
     'calibration',
 )
+FRAME_NAME = re.compile(r'(base|tool)_[^.]+')
 FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay', 'lens')
 JOINT_KEYS = ('name', 'type', *ROW_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
 TWO_TURNS = 4.0 * math.pi
@@ -170,6 +172,11 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
 def parse_frames(content: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Return the frame arguments of a chain; errors name them `where`."""
     others = dictionary(content.get('frames'), f'{where}: frames')
+    for name in others:
+        if not FRAME_NAME.fullmatch(name):
+            raise ConfigError(
+                f'{where}: frames: names are base_... or tool_... without dots, not "{name:.100}"'
+            )
     return {
         'base': _frame(content.get('base'), f'{where}: base'),
         'tool': _frame(content.get('tool'), f'{where}: tool'),

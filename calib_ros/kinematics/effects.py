@@ -252,7 +252,7 @@ def _torques(chain: _Arm, q: FloatArray, joints: Index, ends: FloatArray | None)
     turned *= chain.walk.signs[..., np.newaxis]
     if ends is not None:
         torques = np.empty((len(joints), q.shape[1]))
-        turned /= np.linalg.norm(down)
+        turned /= np.linalg.norm(down) or 1.0  # nothing bends without gravity
         for i, axis in enumerate(turned):
             own = np.flatnonzero(joints == i)
             arms = places[ends[own].astype(int), 3] - points[i]

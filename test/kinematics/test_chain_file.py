@@ -142,7 +142,7 @@ def test_defaults_and_numbers_without_a_dot():
     assert not chain.tool.fixed
 
 
-BASE = UR + 'base: {xyz: [0, 0, 0], quat_xyzw: [0, 0, 0, 1]}\n'
+BASE = UR + 'base: {xyz: [0, 0, 0], quat_xyzw: [0, 0, 0, 1]}\nframes: {tool_1: null}\n'
 MANY = (f'\n- {{name: j{k}, a: 0, alpha: 0, d: 0, theta: 0}}' for k in range(45))
 WRONG = [
     ('alpha:', 'alpha: 0.0, alpha:', 'key "alpha" appears twice'),
@@ -173,6 +173,11 @@ WRONG = [
     ('[0, 0, 0, 1]', '[0, 0, 0, 1.01]', r'base.quat_xyzw must have length 1 .* not 1.01'),
     ('[0, 0, 0, 1]', '[0, 0, 0, 0]', 'base.quat_xyzw must have length 1'),
     ('xyz: [0, 0, 0]', 'fixed: 1', 'base.fixed must be true or false, not 1'),
+    *(
+        ('{tool_1: null}', f'{{{name}: null}}', f'base_... or tool_... without dots, not "{name}"')
+        for name in ('base', 'camera', 'tool_a.b', 'base_')
+    ),
+    ('name: joint_2', 'name: tool_1', 'must not be named "tool_1"'),
     ('name: some_ur', 'name: [', 'not valid YAML'),
     ('convention: standard', 'convention: [standard]', 'cell'),
     ('convention: standard', 'convention: 1', 'cell'),

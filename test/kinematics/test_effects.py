@@ -125,6 +125,12 @@ def test_torques_are_the_work_of_gravity(robot, sign, rng):
         np.testing.assert_allclose(phi[1:], (ahead[1] - behind[1])[i:] / 2e-5, atol=1e-8)
 
 
+def test_nothing_bends_without_gravity(rng):
+    chain = replace(loaded(UR10E, rng), gravity=(0.0, 0.0, 0.0))
+    names = [*effects.members(chain, 'gravity'), *effects.members(chain, 'compliance')]
+    assert not effects.basis(chain, names, chain.random_joints(4, rng).T, None).any()
+
+
 def test_effects_may_be_a_third_of_an_arc_minute_or_one_of_what_bends():
     minute = np.radians(1.0 / 60.0)
     for group in effects.GROUPS:
