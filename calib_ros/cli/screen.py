@@ -37,7 +37,7 @@ class Screen:
 
     def data(self, text: str) -> None:
         """Print requested data, even if quiet."""
-        print(text)
+        print(_printable(text))
 
     def say(self, text: str) -> None:
         """Print lines; on a terminal, long ones are wrapped."""

@@ -95,6 +95,9 @@ def test_identify_and_verify_are_filed(calibrated, capsys):
     said = capsys.readouterr()
     assert said.out.splitlines()[1:] == lines[1:]
     assert '0041: ' in said.err
+    other.file(replace(rows[0], serial='0040', source='a\x1b[31mb'))
+    assert main(['history', 'history', '--robot', '0040']) == 0
+    assert 'a?[31mb' in capsys.readouterr().out  # no command to the terminal
 
 
 def test_nights_that_no_file_keeps_are_filed_all_the_same(folder, monkeypatch):
