@@ -55,18 +55,16 @@ def _images(options: argparse.Namespace, screen: Screen) -> int:
 def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Image | Flaw]]:
     if not options.images.exists():
         raise InputError(f'there is nothing at {options.images}')
-    folder = options.images.is_dir()
-    if not folder:
+    if not options.images.is_dir():
         refuse_others(options.images, 'images', 'images', 'bag')
-    paths = image_files(options.images) if folder else []
-    if folder and not paths and not (options.images / 'metadata.yaml').exists():
-        raise InputError(f'{options.images} has neither images ({", ".join(SUFFIXES)}) nor a bag')
-    for k, path in enumerate(paths):
-        work(path.name)
-        work(k / len(paths))
-        yield path.name, read_image(path)
-    if paths:
+    elif paths := image_files(options.images):
+        for k, path in enumerate(paths):
+            work(path.name)
+            work(k / len(paths))
+            yield path.name, read_image(path)
         return
+    elif not (options.images / 'metadata.yaml').exists():
+        raise InputError(f'{options.images} has neither images ({", ".join(SUFFIXES)}) nor a bag')
     for k, (stamp, message) in enumerate(pictures(options.images, options.topic), 1):
         work(f'image {k}')
         yield str(stamp), image_of(message)
