@@ -219,12 +219,17 @@ class Cell:
             timer.reset()
 
 
+NODE = f"""
+from calib_ros.ros import node
+node.DIAGNOSTICS_PERIOD = {node_module.DIAGNOSTICS_PERIOD}
+raise SystemExit(node.main())
+"""
+
+
 class Child:
     """The node in a process of its own, and what it prints."""
 
-    def __init__(
-        self, *arguments, domain=None, command=('-m', 'calib_ros.ros.node'), **parameters
-    ):
+    def __init__(self, *arguments, domain=None, command=('-c', NODE), **parameters):
         environment = {
             name: value
             for name, value in os.environ.items()

@@ -299,7 +299,8 @@ def test_printed_figures_are_whole(chromium, result):
 def test_a_printed_fleet_is_whole(chromium, tmp_path):
     plant = plants.write_plant(tmp_path, [60 * '7'], 2, poses=12)
     out = tmp_path / 'out'
-    main(['fleet', str(plant), '--history', str(tmp_path / 'history'), '--out', str(out)])
+    given = ['--history', str(tmp_path / 'history'), '--out', str(out), '--workers', '1']
+    main(['fleet', str(plant), *given])
     seen = Seen(chromium, out / 'index.html', 1280)
     seen.page.wait_for_function(f'Math.max(...{WIDTHS}) > 700')
     printed = printed_widths(seen.page)

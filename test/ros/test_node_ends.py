@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from ros_cell import PATIENCE, START, STOPS, Cell, Child, direct, part, topics, values_of
+from ros_cell import NODE, PATIENCE, START, STOPS, Cell, Child, direct, part, topics, values_of
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -133,15 +133,10 @@ def noisy(self):
     return close(self)
 node.CalibrationNode.close = noisy
 """
-RUN = """
-import sys
-from calib_ros.ros.node import main
-sys.exit(main())
-"""
 
 
 def test_ended_while_an_identification_runs(journal):
-    command = ('-c', SLOW_IDENTIFICATION + RUN)
+    command = ('-c', SLOW_IDENTIFICATION + NODE)
     with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
         cell.start_call('identify')
         child.wait_for('identifying')

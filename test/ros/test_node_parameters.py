@@ -266,9 +266,10 @@ def test_the_parameter_file_applies_under_a_namespace(tmp_path):
     path = tmp_path / 'parameters.yaml'
     path.write_text(text)
     words = ('--params-file', str(path), '-r', '__ns:=/cell_2', '-r', '__node:=arm')
+    given = {'serial': '0012', 'data_dir': tmp_path, 'command': ('-m', 'calib_ros.ros.node')}
     with (
         Cell() as cell,
-        Child(*words, domain=cell.domain, serial='0012', data_dir=tmp_path) as child,
+        Child(*words, domain=cell.domain, **given) as child,
     ):
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
         assert 'cell_2.arm' in child.wait_for('ready to calibrate meca500')
