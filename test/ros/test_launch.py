@@ -7,7 +7,6 @@ import re
 import pytest
 import yaml
 from launching import ROOT, parameters_of
-from ros_cell import Cell
 
 from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
 from calib_ros.ros.arguments import (
@@ -118,16 +117,3 @@ def test_launch_commands_in_the_documents_are_valid(name):
 def test_arguments_of_another_launch_file_that_includes_ours_are_its_own():
     command = ['ros2', 'launch', 'my_cell', 'all.launch.py', 'gripper:=true']
     refuse_unknown(command, 'calibration.launch.py', ['chain'])
-
-
-def test_a_real_node_passes_corrected_trajectories_by_the_remapped_topics():
-    remap = (
-        '~/joint_trajectory:=/planned',
-        '~/compensated_joint_trajectory:=/jtc/joint_trajectory',
-    )
-    with Cell() as cell:
-        node = cell.start(remap=remap, chain='ur10e')
-        assert '/jtc/joint_trajectory' in {each.topic_name for each in node.publishers}
-        assert '/planned' in {
-            name for name, _ in node.get_subscriber_names_and_types_by_node(NODE, '/')
-        }

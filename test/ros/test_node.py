@@ -97,6 +97,9 @@ def test_what_looks_wrong_is_told_live_and_of_a_bag(tmp_path, capfd, recording):
         assert status in answer.message
         assert said in cell.in_full(answer)
         cell.spin_until(lambda: words and status in words[-1].data)
+        cell.done('save')
+    (page,) = tmp_path.glob('*Z.html')
+    assert said in page.read_text().replace('\xa0', ' ')
 
 
 def test_identify_answers_publishes_and_is_saved(tmp_path, recording, truth):

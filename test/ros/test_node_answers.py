@@ -11,25 +11,27 @@ from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
-from ros_cell import STOPS, Cell, pose_messages, stamp_ns, topics
+from ros_cell import STOPS, Cell, part, pose_messages, stamp_ns, topics, true_arm
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.reasons import Rule
-from calib_ros.estimation.problem import Problem
 from calib_ros.files.history import History
-from calib_ros.files.loading import Loaded
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
+from calib_ros.identification.records import nominal_document
+from calib_ros.kinematics.chain_file import (
+    calibration_record,
+    dump_chain,
+    load_chain,
+    parse_chain,
+)
 from calib_ros.report.advice import rules
-from calib_ros.ros.identifying import KEEP, NOT_FILED, Snapshot, _page, _without_middle
+from calib_ros.ros.identifying import KEEP, NOT_FILED, _without_middle
 from calib_ros.ros.inputs import deserialised
 from calib_ros.sampling.batches import Stream, feed
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sources import STANDARD
-from calib_ros.settings import Settings
 
 
 def test_errors_are_answers(cell, recording):
@@ -48,7 +50,7 @@ def test_errors_are_answers(cell, recording):
     assert 'too few different poses: 2 measured, at least 5' in cell.refused('identify').message
 
 
-def test_clocks_that_disagree_are_to_be_set_first(cell, recording):
+def test_clocks_that_disagree_are_to_be_set_first(unsearched, cell, recording):
     session, (joints, poses) = cell.node.session, topics(recording).values()
     come = sorted([*joints, *poses], key=stamp_ns)  # as they arrive, whatever their stamps
     for message in poses:
@@ -158,16 +160,6 @@ def test_a_refusal_leaves_its_report(unsearched, cell, recording):
     assert f'; report: {page}' in cell.in_full(answer)
 
 
-def test_the_page_that_is_saved_has_the_warnings():
-    arm, rng = load_chain('ur10e'), np.random.default_rng(0)
-    problem = Problem(arm, measure(arm, arm.random_joints(10, rng), rng, 5e-5, 2e-4))
-    origin = {'journal': '', 'robot_serial': ''}
-    given = Snapshot(
-        Loaded(problem, {}, ('the clock jumped',)), Settings(), (), {}, origin, '', ''
-    )
-    assert 'the clock jumped' in _page(given, identify(problem))
-
-
 def test_answers_are_in_the_log_as_well(cell, recording):
     told = cell.log()
 
@@ -274,15 +266,13 @@ def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recor
     assert broken.rms_mm > 3.0 > holds.rms_mm
 
 
-def test_the_calibration_of_another_robot_of_the_kind_is_not_loaded(tmp_path, recording):
+def test_the_calibration_of_another_robot_of_the_kind_is_not_loaded(tmp_path):
     saved = tmp_path / 'saved.yaml'
-    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path)}
-    with Cell(**parameters, serial='7', target_filename=str(saved)) as cell:
-        cell.play(topics(recording))
-        cell.done('identify')
-        cell.done('save')
+    record = {'nominal': nominal_document(load_chain('ur10e')), 'robot_serial': '7'}
+    saved.write_text(dump_chain(true_arm(), record))
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'calibration_filename': str(saved)}
     for serial, loads in (('8', False), ('7', True), ('', True)):
-        with Cell(**parameters, serial=serial, calibration_filename=str(saved)) as cell:
+        with Cell(**parameters, serial=serial) as cell:
             answer = cell.call('load')
             assert answer.success == loads, answer.message
             assert loads or 'the robot with serial "7"; this one is "8"' in answer.message
@@ -344,8 +334,8 @@ def test_what_cannot_be_loaded_at_the_start_is_told_and_costs_nothing_else(
         cell.spin_until(lambda: heard and said in heard[-1].status[0].message)
         assert heard[-1].status[0].level == DiagnosticStatus.ERROR
         assert node.session.calibration is None
-        cell.play(topics(recording), node=node)
-        cell.done('identify')
+        cell.play(part(recording, 0.0, 4.0), node=node)
+        assert node.session.samples
 
 
 def test_the_settings_of_the_identification_are_saved_with_it(tmp_path, recording, monkeypatch):
@@ -364,6 +354,7 @@ def test_the_settings_of_the_identification_are_saved_with_it(tmp_path, recordin
         cell.spin_until(lambda: any(f'the report of {path} is not' in m.msg for m in told))
         settings = yaml.safe_load(path.with_suffix('.settings.yaml').read_text())
         used = settings['/**']['ros__parameters']
+        assert calibration_record(path.read_text())['robot_serial'] == '7'
         assert (used['chain'], used['serial'], used['folds']) == ('ur10e', '7', 4)
 
 
