@@ -115,6 +115,14 @@ def test_results_are_read_only():
                 ('folds', 1, 'at least 2, not 1'),
             )
         ),
+        *(
+            (partial(calib_ros.Settings, **{name: value}), f'{name} must be .*, not {value}')
+            for name, value in (
+                *(('sigma_position', 0.0), ('sigma_position', -1e-4), ('sigma_position', np.nan)),
+                *(('sigma_orientation', np.inf), ('max_gap', -0.1), ('max_gap', np.inf)),
+                *(('joint_buffer', 1), ('pose_buffer', 0), ('folds', 1)),
+            )
+        ),
         (
             partial(calib_ros.Problem, CHAIN, SEEN, priors={'*.a': 0}),
             r"priors\['\*.a'\] must be a p",
@@ -210,6 +218,11 @@ def test_numbers_that_cannot_be_are_named(call, said):
 def test_what_cannot_be_used_is_refused_with_an_error_of_ours(call):
     with pytest.raises(calib_ros.CalibrationError):
         call()
+
+
+def test_settings_at_the_edge_are_taken():
+    edge = {'max_gap': 1e-6, 'joint_buffer': 2, 'pose_buffer': 1, 'folds': 2}
+    assert calib_ros.Settings(**edge).folds == 2
 
 
 def test_an_argument_that_is_missing_is_told_as_python_does():

@@ -13,7 +13,7 @@ from calib_ros.apply.workspace import SIDES, regions, survey
 from calib_ros.cli.workspace import PLACEMENT_FILES, WORKSPACE_FILES
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.programs import csv_of, read_joints, read_poses
-from calib_ros.identification.calibration import Calibration, load_calibration
+from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain
 from calib_ros.kinematics.se3 import to_quat
@@ -80,11 +80,6 @@ def test_frames_that_are_fixed_stay(cell, tmp_path):
     assert np.abs(arm.before.tool.matrix - result.chain.tool.matrix).max() > 1e-5
 
 
-def write_result(folder, result):
-    folder.mkdir(exist_ok=True)
-    (folder / 'calibration.yaml').write_text(Calibration.of(result).dump())
-
-
 # Where errors are large
 
 
@@ -131,8 +126,9 @@ def test_a_map_holds_the_rms_of_each_cell(rng):
 
 
 @pytest.fixture
-def folder(cell, tmp_path):
-    write_result(tmp_path / 'result', cell[1])
+def folder(arm, tmp_path):
+    (tmp_path / 'result').mkdir()
+    (tmp_path / 'result' / 'calibration.yaml').write_text(arm.dump())
     return 'result'
 
 
