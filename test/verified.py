@@ -10,7 +10,9 @@ from calib_ros.apply import simulation
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report.verdicts import each_in_words, likely, remarks
+from calib_ros.report.page import Origin
+from calib_ros.report.poses import poses_to_verify
+from calib_ros.report.verdicts import each_in_words, likely, remarks, verification_report
 
 UR = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)
@@ -33,6 +35,12 @@ def with_errors(arm, errors):
     """Return observations whose position errors by the calibrated arm are (N, 3) [m]."""
     seen = measured(arm.chain, UR.random_joints(len(errors), np.random.default_rng(2)), 1, (0, 0))
     return replace(seen, positions=seen.positions + errors)
+
+
+def verification_page(chain, sets, found):
+    """Return the page of a verification of an arm by some observations."""
+    poses = poses_to_verify(chain, sets, found.comparison)
+    return verification_report(chain, found, poses, Origin())
 
 
 def in_words(found):

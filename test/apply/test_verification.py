@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from designs import design_of
 from scipy import stats
-from verified import NOISE, UR, in_words, measured, with_errors
+from verified import NOISE, UR, in_words, measured, verification_page, with_errors
 
 from calib_ros.apply import simulation, verification
 from calib_ros.apply.candidates import iso_9283_poses
@@ -18,9 +18,7 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import invert
-from calib_ros.report.page import Origin
-from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verdicts import _by_configuration, verification_report
+from calib_ros.report.verdicts import _by_configuration
 from calib_ros.shown import rounded
 
 _UNIT = ['(mean', '+', '3', 'sigma)']
@@ -30,9 +28,6 @@ _UNIT = ['(mean', '+', '3', 'sigma)']
 def program():
     """Return the joint values of the five test poses."""
     return iso_9283_poses(design_of(UR), np.random.default_rng(0)).joints
-
-
-# Test poses
 
 
 @pytest.mark.parametrize(
@@ -67,9 +62,6 @@ def test_an_arm_that_moves_in_a_plane_reaches_no_cube(rng):
     rows = tuple(Joint(f'j{k}', a=0.3) for k in range(3))
     with pytest.raises(InputError, match='of any cube'):
         iso_9283_poses(design_of(Chain('planar', 'standard', rows)), rng)
-
-
-# The verdict
 
 
 @pytest.mark.parametrize('step', [5e-4, 2e-3, 5e-3])
@@ -207,8 +199,7 @@ def test_the_repeatability_of_the_standard_needs_the_program(cell, arm, program)
     for each, word in ((found, 'repeatability'), (alone, 'scatter')):
         assert f'after   {word} (mean + 3 sigma)' in in_words(each)
         assert ('AP after' in _by_configuration(each).head) is each.by_program
-        poses = poses_to_verify(arm.chain, [seen], each.comparison)
-        page = verification_report(UR, each, poses, Origin())
+        page = verification_page(arm.chain, [seen], each)
         assert ('its place in the program' in str(page.accuracy)) is each.by_program
 
 
@@ -336,9 +327,7 @@ def test_a_session_is_judged_without_a_tolerance(arm, cell):
             same = verify(arm, seen, 1.5 * residual)
             assert (same.verdict, same.needed) == (verdict, found.needed)
             assert f'about {found.needed} poses with the same RMS error' in in_words(found)
-            page = verification_report(
-                UR, found, poses_to_verify(UR, seen, found.comparison), Origin()
-            )
+            page = verification_page(UR, seen, found)
             said = f'1.5 times the expected error: {rounded(1.5e3 * residual)} mm. If the whole'
             assert any(said in text for text in page.verdict.text)
         else:
@@ -365,9 +354,7 @@ def test_what_cannot_be_verified_is_refused(cell, arm):
         with pytest.raises(ConfigError, match=f'tolerance must be .* not {tolerance}'):
             verify(arm, [seen], tolerance, 0.95)
     for confidence in (0.4, 1.0, 95.0):
-        with pytest.raises(
-            ConfigError, match=f'confidence must be .* 0.5 and 1, not {confidence}'
-        ):
+        with pytest.raises(ConfigError, match=f'must be .* 0.5 and 1, not {confidence}'):
             verify(arm, [seen], None, confidence)
     with pytest.raises(InputError, match='4 poses were measured; at least 5'):
         verify(arm, [measured(true, joints[:4])], 1e-3)

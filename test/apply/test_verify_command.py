@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from designs import design_of
 from measured import rows_of, write_csv
-from verified import NOISE, UR, in_words, measured, with_errors
+from verified import NOISE, UR, in_words, measured, verification_page, with_errors
 
 from calib_ros import Calibration, Problem, identify, load_calibration
 from calib_ros.apply.candidates import Visibility
@@ -16,9 +16,7 @@ from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.apply.verification import verify
 from calib_ros.cli.common import Status
 from calib_ros.files.programs import joints_csv, read_joints
-from calib_ros.report.page import Origin
-from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verdicts import remarks, standing, verification_report
+from calib_ros.report.verdicts import remarks, standing
 
 
 @pytest.fixture
@@ -204,8 +202,7 @@ def test_a_mistake_in_the_measurements_is_named_and_no_verdict_on_the_arm(cell, 
         (said,) = remarks(found)
         assert words in said
         assert standing(found)[0].state == 'open'
-        poses = poses_to_verify(arm.chain, [wrong], found.comparison)
-        _, told = verification_report(arm.chain, found, poses, Origin()).verdict.text
+        _, told = verification_page(arm.chain, [wrong], found).verdict.text
         assert words in told
 
 
@@ -225,9 +222,7 @@ def test_a_named_cause_is_the_next_step_and_said_once(cell, arm):
         named = changed is not turned
         assert any('Calibrate again' in each for each in steps) is not named
         assert not any('active' in each for each in steps)  # it plays no part
-        page = verification_report(
-            arm.chain, found, poses_to_verify(arm.chain, [changed], found.comparison), Origin()
-        )
+        page = verification_page(arm.chain, [changed], found)
         assert (page.steps, page.remarks) == (steps, ())
 
 

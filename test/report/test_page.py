@@ -13,6 +13,7 @@ import pytest
 from measured import TEST, TRAIN, TRUE, UR, measured
 from pages import Page, page_of, problem_of, report_of
 from plotly import graph_objects
+from verified import verification_page
 
 from calib_ros import Calibration, Problem, identify, verify
 from calib_ros.apply import simulation
@@ -26,10 +27,9 @@ from calib_ros.report.documents import as_document
 from calib_ros.report.explorer import BANDS, SINGLE, WORST, explorer
 from calib_ros.report.page import Headline, Origin, markdown, render
 from calib_ros.report.plots import drawing
-from calib_ros.report.poses import JUDGED, poses_of, poses_to_verify
+from calib_ros.report.poses import JUDGED, poses_of
 from calib_ros.report.reports import identification_report
 from calib_ros.report.sections import identity_of
-from calib_ros.report.verdicts import verification_report
 from calib_ros.report.words import limits_mm, summary
 
 HOSTILE = '<script>alert(1)</script>"\'&</script><!--'
@@ -62,10 +62,8 @@ def test_poses_are_those_judged_and_their_errors_make_the_figures(solved, folded
     poses = poses_of(problem, result)
     assert len(poses) == (TRAIN if folded else TRAIN + TEST)
     assert (poses.role == JUDGED).sum() == (TRAIN if folded else TEST)
-    for errors, figures in zip(
-        (poses.before, poses.after), result.validation.figures, strict=True
-    ):
-        assert rms_of(errors[poses.judged]) == pytest.approx(figures.rms_mm, rel=1e-12)
+    for errors, found in zip((poses.before, poses.after), result.validation.figures, strict=True):
+        assert rms_of(errors[poses.judged]) == pytest.approx(found.rms_mm, rel=1e-12)
     turned = rms_of(poses.turned_after[poses.judged])
     assert turned == pytest.approx(result.validation.figures[1].rms_mrad, rel=1e-12)
 
@@ -264,10 +262,8 @@ def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
     shown = explorer(result.chain, poses)
     good = ~poses.outlier
     assert sum(shown['cells']['count']) == good.sum()
-    squares = np.square(shown['cells']['rms_after']) * shown['cells']['count']
-    assert np.sqrt(squares.sum() / good.sum()) == pytest.approx(
-        rms_of(poses.after[good]), rel=1e-3
-    )
+    sums = np.square(shown['cells']['rms_after']) * shown['cells']['count']
+    assert np.sqrt(sums.sum() / good.sum()) == pytest.approx(rms_of(poses.after[good]), rel=1e-3)
     assert shown['total'] == len(poses)
     errors = 1e3 * np.linalg.norm(poses.after, axis=1)
     largest = np.quantile(errors[poses.judged], 0.98)
@@ -290,9 +286,7 @@ def test_half_a_million_poses_make_a_page_of_eight_megabytes(solved):
     rng = np.random.default_rng(0)
     one = poses_of(*solved)
     many = one.select(rng.integers(0, len(one), count))
-    many = replace(
-        many, stamps_ns=np.arange(count), after=many.after + rng.normal(0, 1e-5, (count, 3))
-    )
+    many = replace(many, stamps_ns=np.arange(count), after=rng.normal(0, 1e-4, (count, 3)))
     shown = explorer(result.chain, many)
     assert len(shown['role']) <= 2 * WORST
     report = replace(report_of(*solved), explorer=shown)
@@ -306,8 +300,7 @@ def test_a_verification_has_its_verdict_first(solved):
     problem, result = solved
     sets = (problem.held_out,)
     found = verify(Calibration.of(result), sets, 1e-3)
-    poses = poses_to_verify(result.chain, sets, found.comparison)
-    page = page_of(verification_report(result.chain, found, poses, Origin()))
+    page = page_of(verification_page(result.chain, sets, found))
     order = ('PASS', 'not the corrected robot', 'Accuracy before')
     where = [page.text.index(words) for words in order]
     assert where == sorted(where)
@@ -317,8 +310,7 @@ def test_a_verification_has_its_verdict_first(solved):
     assert len(page.data['explorer']['role']) == TEST
     sets = (problem.held_out.select(np.arange(TEST) // 2),)
     found = verify(Calibration.of(result), sets, 1e-3)
-    poses = poses_to_verify(result.chain, sets, found.comparison)
-    page = page_of(verification_report(result.chain, found, poses, Origin()))
+    page = page_of(verification_page(result.chain, sets, found))
     assert f'Measurements {TEST}  Different poses {TEST // 2}' in page.text
 
 

@@ -6,7 +6,7 @@ from datetime import datetime, timezone
 import numpy as np
 import pytest
 from pages import problem_of, report_of
-from verified import in_words
+from verified import in_words, verification_page
 
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
@@ -20,10 +20,8 @@ from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report import words
 from calib_ros.report.advice import FAR
-from calib_ros.report.page import Origin
-from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.reports import CLOSER, may_be_closer
-from calib_ros.report.verdicts import standing, verification_report
+from calib_ros.report.verdicts import standing
 from calib_ros.report.words import between, still_holds, verdict
 from calib_ros.shown import rounded, sentence
 
@@ -121,8 +119,7 @@ def test_the_error_told_is_the_one_within_its_limits():
     assert (row.rms_mm, row.rms_freedom) == pytest.approx((1e3 * found.rms, found.freedom))
     fitted = replace(found, reused=0.1)  # no night of a chart
     assert verified(arm, fitted, filing).rms_freedom is None
-    poses = poses_to_verify(arm, [seen], found.comparison)
-    report = verification_report(arm, found, poses, Origin())
+    report = verification_page(arm, [seen], found)
     assert f'each counted once, is {1e3 * found.rms:.3f} mm' in report.verdict.text[0]
     assert any('refitted' in each for each in report.verdict.text)
 
