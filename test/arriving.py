@@ -99,7 +99,5 @@ def tour(**settings):
 def assert_same(found, expected):
     assert len(found) == len(expected)
     for one, other in zip(found, expected, strict=True):
-        for field in fields(Sample):
-            np.testing.assert_array_equal(
-                getattr(one, field.name), getattr(other, field.name), field.name
-            )
+        for name in (field.name for field in fields(Sample)):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name), name)

@@ -139,10 +139,7 @@ def test_no_name_means_two_things():
 
 
 def test_no_two_modules_import_each_other():
-    graph = {
-        module: {inner(name) for name in imports(path)} - {None}
-        for module, path in MODULES.items()
-    }
+    graph = {module: {inner(n) for n in imports(p)} - {None} for module, p in MODULES.items()}
     TopologicalSorter(graph).prepare()
 
 

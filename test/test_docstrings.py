@@ -26,10 +26,8 @@ def test_public_functions_of_arrays_give_their_shapes(path):
     for function in public_functions(ast.parse(path.read_text()).body):
         arguments = [*function.args.args, *function.args.kwonlyargs]
         kinds = [each.annotation for each in arguments] + [function.returns]
-        if not re.search(
-            r'\b(FloatArray|NDArray|Index|Flags)\b',
-            ' '.join(ast.unparse(each) for each in kinds if each),
-        ):
+        kinds = ' '.join(ast.unparse(each) for each in kinds if each)
+        if not re.search(r'\b(FloatArray|NDArray|Index|Flags)\b', kinds):
             continue
         text = ast.get_docstring(function) or ''
         assert re.search(r'\((\.{3}|\w[\w +]*,)[^)]*\)', text), f'{function.name}: (N, n), ...?'

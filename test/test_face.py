@@ -29,7 +29,5 @@ def test_help_of_a_value_says_what_its_fields_are():
 def test_the_import_loads_nothing_else():
     """It is for this that the names are loaded late: numpy alone takes 0.1 s."""
     line = 'import sys, calib_ros; print(sorted(m for m in sys.modules if "numpy" in m))'
-    shown = subprocess.run(
-        [sys.executable, '-c', line], check=True, capture_output=True, text=True
-    )
-    assert shown.stdout.strip() == '[]'
+    ran = subprocess.run([sys.executable, '-c', line], check=True, capture_output=True, text=True)
+    assert ran.stdout.strip() == '[]'

@@ -27,9 +27,6 @@ ARM = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4))
 HEAD = 'convention: standard\njoints:\n- {name: a, a: 0, alpha: 0, d: 0, theta: '
 
 
-# ---- messages of errors
-
-
 @pytest.mark.parametrize(
     'err',
     [
@@ -52,8 +49,6 @@ def test_the_command_line_cuts_what_the_system_says(capsys):
     assert main(['identify', '--csv', 'x' * 5000, '--chain', 'ur10e']) == 1
     assert len(capsys.readouterr().err) <= LONGEST + len('calib_ros: \n')
 
-
-# ---- YAML
 
 BOMBS = {
     'aliases': 'a: &a [x, x, x, x, x, x, x, x, x]\n'
@@ -97,9 +92,6 @@ def test_a_limit_as_large_as_none_is_none():
     assert parse_chain(HEAD + '0, lower: -1e308, upper: 1e308}').joints[0].lower is None
 
 
-# ---- URDF
-
-
 def urdf(links, kind='fixed', axis='0 0 1'):
     text = ['<robot name="r">', *(f'<link name="l{k}"/>' for k in range(links))]
     for k in range(links - 1):
@@ -123,9 +115,6 @@ def test_the_most_links_are_read_and_more_refused(monkeypatch):
 
 def test_a_long_axis_is_a_direction():
     assert chain_from_urdf(urdf(2, axis='0 1e5 1e5')).joint_names == ('j0',)
-
-
-# ---- tables
 
 
 def table(tmp_path, cells, quaternion=True):

@@ -142,9 +142,7 @@ def place(xyz, rotation):
 
 def reference_forward(text, values, base, tip):
     """Walk from a tip back to a base along the elements of a URDF; values by joint name."""
-    leading = {
-        joint.find('child').get('link'): joint for joint in ET.fromstring(text).findall('joint')
-    }
+    leading = {j.find('child').get('link'): j for j in ET.fromstring(text).findall('joint')}
     pose = np.eye(4)
     while tip != base:
         joint = leading[tip]

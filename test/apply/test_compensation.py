@@ -40,9 +40,6 @@ def with_effects(chain, seed=0):
     return chain.with_effect_values(dict(zip(names, values, strict=True)))
 
 
-# Reaching the pose
-
-
 @pytest.mark.parametrize('name', [*SIX, *REDUNDANT])
 def test_arms_of_six_joints_and_more_reach_the_pose_by_the_least_change(name):
     """Of geometric errors, and of others besides."""
@@ -115,9 +112,6 @@ def test_every_sample_is_reached_within_all_limits_or_refused(drawn):
     assert (turn <= (1e-6 if freedoms == 6 else 0.02)).all()
 
 
-# What is refused
-
-
 def test_a_joint_that_would_go_beyond_its_limit_is_refused():
     q = regular(UR, 20)
     narrow = at_limit(UR, UR_TRUE, q[7])
@@ -138,9 +132,7 @@ def test_a_command_beyond_a_limit_is_refused(side):
     refusal = only_refusal(compensate(compensator, q, progress=shares.append))
     assert shares
     assert refusal.sample == 1
-    assert f'the command {side * 3.2} of elbow_joint is beyond its limits -3.14159 to 3.14159' in (
-        refusal.reason
-    )
+    assert f'{side * 3.2} of elbow_joint is beyond its limits -3.14159 to 3.14' in refusal.reason
     within = side * (3.2 - 2.0 * np.pi)
     assert refusal.reason.endswith(f'a full turn away, {within:.6g} is within them: give that')
     tolerant = replace(compensator, largest_position_error=1.0, largest_orientation_error=1.0)
@@ -257,9 +249,8 @@ def test_a_correction_beyond_the_limit_is_refused():
 
 
 def test_the_calibration_of_another_robot_is_refused():
-    other = replace(
-        ROBOTS['ur5e'], joints=tuple(replace(j, mass=0.0) for j in ROBOTS['ur5e'].joints)
-    )
+    ur5e = ROBOTS['ur5e']
+    other = replace(ur5e, joints=tuple(replace(j, mass=0.0) for j in ur5e.joints))
     result = compensate(Compensator(UR, other), regular(UR, 20))
     assert len(result.refusals) == 20
     assert in_words(Compensator(UR, other), result) == '0 of 20 points corrected'

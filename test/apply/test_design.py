@@ -91,9 +91,8 @@ def test_the_base_frame_has_no_influence(rng):
     moved = replace(chain, base=simulation.random_frame(rng, 2.0))
     q, task = some(chain, 60), some(chain, 50, 2)
     np.testing.assert_array_equal(choose(design_of(chain), q, 20), choose(design_of(moved), q, 20))
-    np.testing.assert_allclose(
-        accuracy(design_of(chain), q, task), accuracy(design_of(moved), q, task), rtol=1e-6
-    )
+    found, again = (accuracy(design_of(each), q, task) for each in (chain, moved))
+    np.testing.assert_allclose(found, again, rtol=1e-6)
 
 
 def test_an_unknown_tool_is_taken_off_the_axis():

@@ -21,12 +21,8 @@ from calib_ros.kinematics.follower import mobility
 from calib_ros.kinematics.inverse import solve
 
 IIWA = load_chain('kuka_iiwa14')
-LOCKED = replace(
-    IIWA,
-    joints=tuple(
-        replace(j, lower=0.3, upper=0.3) if k == 2 else j for k, j in enumerate(IIWA.joints)
-    ),
-)
+HELD = replace(IIWA.joints[2], lower=0.3, upper=0.3)
+LOCKED = replace(IIWA, joints=(*IIWA.joints[:2], HELD, *IIWA.joints[3:]))
 HAND = 3
 PALLETISER = Chain(
     'palletiser',

@@ -62,9 +62,8 @@ def test_the_joint_values_bring_the_arm_to_the_placed_task(arm):
         assert 10 < reached.sum() < len(reached)
         turned = int(np.flatnonzero(reached & (found.turns > 2.0))[0])
         for which in (found.best, found.centre, turned):
-            np.testing.assert_allclose(
-                chain.forward(found.joints[which]), wanted(chain, found, which, task), atol=1e-8
-            )
+            meant = wanted(chain, found, which, task)
+            np.testing.assert_allclose(chain.forward(found.joints[which]), meant, atol=1e-8)
             again = arm.expected(found.joints[which], model).mean()
             assert found.errors[which] == pytest.approx(again, rel=1e-12)
         assert found.errors[found.best] == np.nanmin(found.errors)
@@ -105,9 +104,7 @@ def test_placements_keep_to_the_region(arm, placed):
 
 def test_a_finer_search_does_not_find_much_more(arm):
     region = np.array([[0.3, -0.5, -0.3], [1.0, 0.5, 0.5]])
-    coarse, fine = (
-        place(arm, TASK[::2], 'mean', 'nominal', region, cells).errors for cells in (4, 7)
-    )
+    coarse, fine = (place(arm, TASK[::2], 'mean', 'nominal', region, k).errors for k in (4, 7))
     assert np.nanmin(coarse) < 1.1 * np.nanmin(fine)
     assert np.nanmin(coarse) < np.nanmin(coarse[: 4**3])  # refined about the best of the grid
 

@@ -105,9 +105,7 @@ def test_plan_takes_candidates_task_and_poses_taken_from_files(run, tmp_path):
     _, after, _ = run('plan', *common, '--taken', 'taken.csv', '--criterion', 'task')
 
     def last(text):
-        return float(
-            next(line for line in text.splitlines() if line.startswith('    12')).split()[1]
-        )
+        return float(next(row for row in text.splitlines() if row.startswith('    12')).split()[1])
 
     assert last(after) < 0.9 * last(alone)
     assert 'the tool' not in alone
@@ -115,13 +113,12 @@ def test_plan_takes_candidates_task_and_poses_taken_from_files(run, tmp_path):
 
 
 def test_plan_says_how_many_poses_a_wanted_error_needs(run, tmp_path):
-    _, out, _ = run(
-        'plan', '--chain', 'ur10e', '--accuracy', 0.1, '--out', 'plan.csv', '--draw', 200
-    )
+    given = ('plan', '--chain', 'ur10e', '--accuracy', 0.1, '--draw', 200)
+    _, out, _ = run(*given, '--out', 'plan.csv')
     count = len(read_joints(tmp_path / 'plan.csv', load_chain('ur10e')))
     assert f'{count} poses reach 0.1 mm' in out
     assert 18 <= count <= 26
-    _, out, _ = run('plan', '--chain', 'ur10e', '--accuracy', 0.1, '--poses', 10, '--draw', 200)
+    _, out, _ = run(*given, '--poses', 10)
     assert f'{count} poses reach 0.1 mm' in out
     assert out.splitlines()[-5].split()[0] == '10'
 

@@ -11,8 +11,6 @@ from calib_ros.apply.program import Program, approaches, compensate_program
 from calib_ros.apply.simulation import faulty
 from calib_ros.errors import InputError, UnknownNameError
 
-# Velocities, accelerations, joints by name
-
 
 @pytest.mark.parametrize('name', ['ur10e', 'kuka_iiwa14', 'kuka_youbot', 'ur10e_on_linear_axis'])
 def test_velocities_and_accelerations_are_those_of_the_corrected_path(name):
@@ -130,10 +128,7 @@ def test_the_unknown_joint_is_that_of_the_program(named):
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
-        (
-            {'names': UR.joint_names[:5], 'positions': np.zeros((2, 5))},
-            'no values of wrist_3_joint',
-        ),
+        ({'names': UR.joint_names[:5], 'positions': np.zeros((2, 5))}, 'no values of wrist_3'),
         ({'names': UR.joint_names[:5]}, '5 joint names do not fit'),
         ({'velocities': np.zeros((3, 5))}, 'rates of shape'),
         ({'velocities': np.full((3, 6), np.inf)}, 'finite'),

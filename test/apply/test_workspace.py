@@ -18,8 +18,6 @@ from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain
 from calib_ros.kinematics.se3 import to_quat
 
-# What is removed and what remains
-
 
 def test_what_is_removed_is_what_the_nominal_arm_misses(cell, arm):
     true, result, _ = cell
@@ -80,9 +78,6 @@ def test_frames_that_are_fixed_stay(cell, tmp_path):
     assert np.abs(arm.before.tool.matrix - result.chain.tool.matrix).max() > 1e-5
 
 
-# Where errors are large
-
-
 def test_the_worst_region_is_found_and_named(rng):
     positions = rng.uniform(-1.0, 1.0, (20_000, 3))
     bad = (positions[:, 0] < -0.6) & (np.abs(positions[:, 1]) < 0.3) & (positions[:, 2] > 0.5)
@@ -120,9 +115,6 @@ def test_a_map_holds_the_rms_of_each_cell(rng):
     assert (len(first), len(second)) == (4, 4)
     np.testing.assert_allclose(rms[:, 0], [3.0, 1.0, 1.0], atol=0.02)
     assert np.isnan(rms[0, 2])
-
-
-# On the command line
 
 
 @pytest.fixture

@@ -193,11 +193,9 @@ def test_a_damaged_bag_is_refused_or_warns_and_says_so_in_the_report(run, tmp_pa
 def test_a_command_is_kept_without_what_logs_in(tmp_path, monkeypatch):
     kept = []
     monkeypatch.setattr('calib_ros.cli.identify._run', lambda options, _: kept.append(options))
-    url = 'memory://user:secret@host/x'
+    url = 'memory://user:secret@h/x'
     assert main(['identify', 'a table.csv', '--chain', 'ur10e', '--history', url]) is None
-    assert kept[0].typed == (
-        "calib_ros identify 'a table.csv' --chain ur10e --history memory://host/x"
-    )
+    assert kept[0].typed == "calib_ros identify 'a table.csv' --chain ur10e --history memory://h/x"
 
 
 def test_the_package_is_a_program_that_reads_a_pipe(table, tmp_path):
@@ -265,11 +263,9 @@ def test_what_each_device_measures_again_is_judged_in_its_own_frame(of_two, run,
     assert (status, out[:6]) == (0, 'PASS: ')
     of_arm = '--calibration', of_two, '--tolerance', '0.3', '--json', '--out', 'verified'
     status, out, _ = run('verify', *judged, *of_arm)
-    found = json.loads(out)
-    assert (status, found['verdict'], found['limit_mm'], found['poses']) == (0, 'PASS', 0.3, 10)
-    assert (
-        found['lower_mm'] < found['rms_mm'] < found['upper_mm'] < 0.3 < found['before']['rms_mm']
-    )
+    told = json.loads(out)
+    assert (status, told['verdict'], told['limit_mm'], told['poses']) == (0, 'PASS', 0.3, 10)
+    assert told['lower_mm'] < told['rms_mm'] < told['upper_mm'] < 0.3 < told['before']['rms_mm']
     status, out, _ = run('identify', *judged, '--previous', of_two)
     assert (status, out[:8]) == (0, 'Accepted')
 

@@ -46,9 +46,7 @@ def piped(text):
 
 
 @pytest.mark.parametrize('command', ['identify', 'verify'])
-def test_a_result_is_told_and_written_although_its_history_is_full(
-    calibrated, monkeypatch, capsys, command
-):
+def test_a_result_is_told_although_its_history_is_full(calibrated, monkeypatch, capsys, command):
     """The verdict was lost with the row, and the report of verify too."""
 
     def fail(history, row):

@@ -48,11 +48,7 @@ def test_robots_with_what_their_group_says(tmp_path):
     ('old', 'new', 'match'),
     [
         ('measured: nights', 'mesured: nights', r'robot 1.*"mesured".*did you mean "measured"'),
-        (
-            'group: weld',
-            'group: wield',
-            r'\(0042\): unknown group "wield".*did you mean "weld"',
-        ),
+        ('group: weld', 'group: wield', r'\(0042\): unknown group "wield".*did you mean "weld"'),
         ('sigma_position', 'sigma_positoin', r'robot 1 .*did you mean "sigma_position"'),
         ('tolerance: 0.3', 'tolerence: 0.3', r'group weld.*did you mean "tolerance"'),
         ('session: A', 'sesion: A', r'robot 2 \(B\).*did you mean "session"'),

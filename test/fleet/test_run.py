@@ -146,9 +146,7 @@ def test_a_night_whose_file_was_put_right_counts_once(unsearched, plant, cluster
         assert [row.verdict for row in results(plant[0], each)] == ['accepted', 'accepted']
 
 
-def test_sessions_without_stamps_are_nights_and_a_night_put_right_is_no_other_setting(
-    plant, tmp_path
-):
+def test_sessions_without_stamps_are_nights_and_one_put_right_is_no_other_setting(plant, tmp_path):
     """Both sessions have the date of their table, and so its time."""
     history, robot = History(tmp_path / 'history'), plant[0]
     settings = robot.settings_hash

@@ -136,9 +136,8 @@ def test_several_changes_and_those_before_a_date(first, rng):
     rows = [replace(r, offsets=r.offsets + 1e-4 * again * (k >= 12)) for k, r in enumerate(rows)]
     changes = watch(rows, 100.0).changes
     assert [joint_of(change) for change in changes] == ['elbow_joint', 'wrist_1_joint']
-    assert [
-        joint_of(c) for c in watch([r for r in rows if r.time >= changes[0].time], 100.0).changes
-    ] == ['wrist_1_joint']
+    later = [r for r in rows if r.time >= changes[0].time]
+    assert [joint_of(c) for c in watch(later, 100.0).changes] == ['wrist_1_joint']
     assert watch([r for r in rows if r.time >= changes[1].time], 100.0).changes == ()
 
 
@@ -147,10 +146,8 @@ def test_two_joints_that_change_at_once_are_found(first, rng, size):
     """Each by so many standard deviations, 12 of which are some 0.1 mm or 0.2 mrad."""
     sigma = size * np.sqrt(np.diag(first.covariance))
     both = ('elbow_joint', 'wrist_2_joint')
-    for names in (
-        ('elbow_joint.theta', 'wrist_2_joint.a'),
-        ('elbow_joint.a', 'wrist_2_joint.theta'),
-    ):
+    for one, other in (('theta', 'a'), ('a', 'theta')):
+        names = f'elbow_joint.{one}', f'wrist_2_joint.{other}'
         rows = list(nights(first, rng, 10))
         moved = sigma * np.isin(first.names, names)
         rows = [replace(r, offsets=r.offsets + moved * (k >= 4)) for k, r in enumerate(rows)]

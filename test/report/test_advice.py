@@ -30,9 +30,7 @@ def test_every_refusal_is_told_in_plain_words(rule, auto):
 
 
 def test_a_verdict_names_each_of_several_mistakes():
-    both = Suspect(
-        'several mistakes at once', 'a and b are swapped (--columns a); c counts (sign: -1)'
-    )
+    both = Suspect('several mistakes at once', 'a, b are swapped (--columns a); c counts (sign)')
     found = Explained((both,), 1.0, 2e-3)
     (told,) = advice.advice([found.reason])
     assert told.in_short.endswith(f': {both.what}: {both.remedy}')
@@ -119,10 +117,8 @@ def test_a_refused_page_says_why_and_what_to_do():
     result = identify(problem)
     assert not result.accepted
     page = page_of(report_of(problem, result))
-    where = [
-        page.text.index(words)
-        for words in ('Not accepted', 'Why it was refused', 'What to do:', 'Accuracy of the')
-    ]
+    order = ('Not accepted', 'Why it was refused', 'What to do:', 'Accuracy of the')
+    where = [page.text.index(words) for words in order]
     assert where == sorted(where)
     for each in advice.advice(result.refusals):
         assert each.heading in page.text

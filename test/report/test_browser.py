@@ -101,9 +101,7 @@ class Seen:
     def end(self):
         self.page.close()
         assert self.faults == []
-        assert [
-            url for url in self.requests if not url.startswith(('file:', 'data:', 'blob:'))
-        ] == []
+        assert [u for u in self.requests if not u.startswith(('file:', 'data:', 'blob:'))] == []
         assert sum(url.startswith('file:') for url in self.requests) == 1
 
 

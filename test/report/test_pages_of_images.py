@@ -39,10 +39,8 @@ def identified(photographs, run, monkeypatch, tmp_path):
     def identified(places, *more):
         words = ['identify', '--chain', 'ur10e', '--eye-in-hand', '--sigma-pixel', '0.1']
         words += ['--detections', 'corners.csv', '--board', 'board.yaml', '--places', places]
-        status, out, _ = run(
-            *words, '--intrinsics', 'camera.yaml', '--out', tmp_path / 'out', *more
-        )
-        return status, ' '.join(out.split()), tmp_path / 'out'
+        code, out, _ = run(*words, '--intrinsics', 'camera.yaml', '--out', tmp_path / 'out', *more)
+        return code, ' '.join(out.split()), tmp_path / 'out'
 
     return identified
 

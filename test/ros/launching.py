@@ -23,38 +23,27 @@ class Action:
         self.args, self.kwargs = args, kwargs
 
 
-def action(name, *keywords):
-    return type(name, (Action,), {'KEYWORDS': keywords})
-
-
-ACTIONS = {
-    'launch': {
-        'LaunchContext': object,
-        'LaunchDescription': list,
-        'LaunchDescriptionEntity': Action,
-    },
+NODE = 'package executable name namespace parameters remappings ros_arguments arguments output'
+KEYWORDS = {
+    'launch': {},
     'launch.actions': {
-        'DeclareLaunchArgument': action('DeclareLaunchArgument', 'default_value', 'description'),
-        'LogInfo': action('LogInfo', 'msg'),
-        'OpaqueFunction': action('OpaqueFunction', 'function'),
-        'RegisterEventHandler': action('RegisterEventHandler'),
-        'TimerAction': action('TimerAction', 'period', 'actions'),
+        'DeclareLaunchArgument': 'default_value description',
+        'LogInfo': 'msg',
+        'OpaqueFunction': 'function',
+        'RegisterEventHandler': '',
+        'TimerAction': 'period actions',
     },
-    'launch.event_handlers': {
-        'OnProcessExit': action('OnProcessExit', 'target_action', 'on_exit')
-    },
+    'launch.event_handlers': {'OnProcessExit': 'target_action on_exit'},
     'launch_ros': {},
-    'launch_ros.actions': {
-        'Node': action(
-            'Node',
-            *('package', 'executable', 'name', 'namespace', 'parameters', 'remappings'),
-            *('ros_arguments', 'arguments', 'output'),
-        )
-    },
-    'launch_ros.parameter_descriptions': {
-        'ParameterValue': action('ParameterValue', 'value_type')
-    },
+    'launch_ros.actions': {'Node': NODE},
+    'launch_ros.parameter_descriptions': {'ParameterValue': 'value_type'},
 }
+ACTIONS = {
+    module: {name: type(name, (Action,), {'KEYWORDS': k.split()}) for name, k in actions.items()}
+    for module, actions in KEYWORDS.items()
+}
+ACTIONS['launch'] = {'LaunchContext': object, 'LaunchDescription': list}
+ACTIONS['launch'] |= {'LaunchDescriptionEntity': Action}
 
 
 def launch(monkeypatch, name, **arguments):
@@ -75,9 +64,7 @@ def launch(monkeypatch, name, **arguments):
 
 
 def nodes(actions):
-    return {
-        each.kwargs['executable']: each.kwargs for each in actions if 'executable' in each.kwargs
-    }
+    return {one.kwargs['executable']: one.kwargs for one in actions if 'executable' in one.kwargs}
 
 
 def parameters_of(words):

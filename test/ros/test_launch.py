@@ -9,13 +9,7 @@ import yaml
 from launching import ROOT, parameters_of
 
 from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
-from calib_ros.ros.arguments import (
-    NODE,
-    REMAPPED,
-    launch_arguments,
-    refuse_unknown,
-    ros_arguments,
-)
+from calib_ros.ros.arguments import NODE, REMAPPED, launch_arguments, refuse_unknown, ros_arguments
 from calib_ros.sampling.sources import STANDARD
 
 
@@ -104,9 +98,8 @@ def test_an_argument_that_does_not_exist_is_refused(launched):
 
 @pytest.mark.parametrize('name', ['README.md', 'docs/node.md'])
 def test_launch_commands_in_the_documents_are_valid(name):
-    commands = re.findall(
-        r'ros2 launch calib_ros (\S+)((?: +\S+:=\S+)*)', (ROOT / name).read_text()
-    )
+    text = (ROOT / name).read_text()
+    commands = re.findall(r'ros2 launch calib_ros (\S+)((?: +\S+:=\S+)*)', text)
     assert commands
     for file, words in commands:
         own = re.findall(r"^    '(\w+)': \(", (ROOT / 'launch' / file).read_text(), re.MULTILINE)

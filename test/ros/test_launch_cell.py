@@ -19,9 +19,7 @@ QUIET = {'rviz': 'false', 'diagnostics': 'false'}
 
 def test_a_cell_has_all_that_belongs_to_it(launched, tmp_path, monkeypatch):
     ends = []
-    monkeypatch.setattr(
-        'atexit.register', lambda *work, **given: ends.append(partial(*work, **given))
-    )
+    monkeypatch.setattr('atexit.register', lambda *f, **k: ends.append(partial(*f, **k)))
     urdf = tmp_path / 'robot.urdf'
     urdf.write_text('<robot name="arm"/>')
     actions, _ = launched(
@@ -99,10 +97,8 @@ def test_the_example_feeds_the_corrected_urdf_to_all(launched, tmp_path, monkeyp
     assert published.kwargs['parameters'][0]['robot_description'].args == (urdf.read_text(),)
 
     def builder(robot, package_name):
-        configured = {'robot_description': 'nominal', 'robot': robot, 'package': package_name}
-        return SimpleNamespace(
-            to_moveit_configs=lambda: SimpleNamespace(to_dict=lambda: configured)
-        )
+        own = {'robot_description': 'nominal', 'robot': robot, 'package': package_name}
+        return SimpleNamespace(to_moveit_configs=lambda: SimpleNamespace(to_dict=lambda: own))
 
     module = ModuleType('moveit_configs_utils')
     module.MoveItConfigsBuilder = builder

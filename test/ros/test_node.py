@@ -58,13 +58,7 @@ def test_direct_bag_and_live_give_equal_observations(request, tmp_path, mode, st
     assert replay(tmp_path / 'bag', replayed).warnings == ()
     parameters = {'chain': 'ur10e', 'mode': mode, 'data_dir': str(tmp_path)}
     with Cell(**parameters) as cell:
-        cell.play(
-            {
-                'measured_pose': pose_messages(recording.poses),
-                'joint_states': joint_messages(recording),
-            },
-            ReliabilityPolicy.BEST_EFFORT,
-        )
+        cell.play(topics(recording), ReliabilityPolicy.BEST_EFFORT)
         live = cell.node.session
         observations = expected.problem().observations
         assert len(observations) == (STOPS if mode == 'dwell' else len(recording.poses))
@@ -140,9 +134,6 @@ def test_identify_answers_publishes_and_is_saved(tmp_path, recording, truth):
         assert target.read_text() == texts[0].data
 
 
-# What it hears
-
-
 def test_every_kind_of_measurement_is_heard(cell, recording):
     covariance = np.diag([1e-8, 2e-8, 3e-8, 4e-8, 5e-8, 6e-8]).ravel().tolist()
     lengths = np.linalg.norm(recording.poses.positions, axis=1)
@@ -174,19 +165,9 @@ def test_joint_states_in_two_parts(tmp_path, recording):
     ]
     parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path)}
     with Cell(**parameters, joint_topics=['base/joints', 'arm/joints']) as cell:
-        cell.play(
-            {
-                'base/joints': parts[0],
-                'arm/joints': parts[1],
-                'measured_pose': pose_messages(recording.poses),
-            }
-        )
-        assert_same(
-            direct(recording).problem().observations, cell.node.session.problem().observations
-        )
-
-
-# Names, time, several robots, the end
+        joints = {'base/joints': parts[0], 'arm/joints': parts[1]}
+        cell.play(joints | {'measured_pose': pose_messages(recording.poses)})
+        assert_same(*(s.problem().observations for s in (direct(recording), cell.node.session)))
 
 
 def test_namespace_and_remapping(tmp_path, recording):
@@ -240,10 +221,9 @@ def test_several_robots_in_one_process(tmp_path, recording):
 
 
 def test_recordings_of_all_topics_tell_what_the_node_published(tmp_path):
-    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
-        node = cell.start(
-            namespace='/hall/left', remap=('__node:=calib',), chain='ur10e', data_dir=str(tmp_path)
-        )
+    given = {'chain': 'ur10e', 'data_dir': str(tmp_path)}
+    with Cell(**given) as cell:
+        node = cell.start(namespace='/hall/left', remap=('__node:=calib',), **given)
         found = cell.peer.get_publisher_names_and_types_by_node
         own = {}
         cell.spin_until(lambda: own.update(found('calib', '/hall/left')) or len(own) > 9)

@@ -20,12 +20,7 @@ from calib_ros.apply.simulation import measure
 from calib_ros.decision.reasons import Rule
 from calib_ros.files.history import History
 from calib_ros.identification.records import nominal_document
-from calib_ros.kinematics.chain_file import (
-    calibration_record,
-    dump_chain,
-    load_chain,
-    parse_chain,
-)
+from calib_ros.kinematics.chain_file import calibration_record, dump_chain, load_chain, parse_chain
 from calib_ros.report.advice import rules
 from calib_ros.ros.identifying import KEEP, NOT_FILED, _without_middle
 from calib_ros.ros.inputs import deserialised
@@ -43,15 +38,12 @@ def test_errors_are_answers(cell, recording):
         ('load', 'no saved calibration of ur10e'),
     ):
         assert said in cell.refused(name).message
-    some = topics(recording)
-    cell.play(
-        {'joint_states': some['joint_states'][:120], 'measured_pose': some['measured_pose'][:8]}
-    )
+    cell.play(part(recording, 0.0, 2.0))
     assert 'too few different poses: 2 measured, at least 5' in cell.refused('identify').message
 
 
 def test_clocks_that_disagree_are_to_be_set_first(unsearched, cell, recording):
-    session, (joints, poses) = cell.node.session, topics(recording).values()
+    session, (joints, poses) = cell.node.session, part(recording, 0.0, 12.0).values()
     come = sorted([*joints, *poses], key=stamp_ns)  # as they arrive, whatever their stamps
     for message in poses:
         message.header.stamp.sec += 3
@@ -113,10 +105,10 @@ def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path,
 
 
 def test_a_short_answer_names_the_mistake(cell, recording):
-    joints = topics(recording)['joint_states']
-    for message in joints:
+    some = part(recording, 0.0, 12.0)
+    for message in some['joint_states']:
         message.position = np.degrees(message.position).tolist()
-    cell.play(topics(recording, joint_states=joints))
+    cell.play(some)
     answer = cell.refused('identify')
     assert answer.message.startswith(
         'NOT accepted, nothing is published: the joint values are in degrees, not radians: '
@@ -145,9 +137,8 @@ def test_what_made_poses_too_few_is_said_with_it(cell, recording):
 
 def test_a_refusal_leaves_its_report(unsearched, cell, recording):
     moved = pose_messages(recording.poses)
-    for message, x in zip(
-        moved, np.random.default_rng(0).uniform(size=STOPS).repeat(4), strict=True
-    ):
+    shifts = np.random.default_rng(0).uniform(size=STOPS).repeat(4)
+    for message, x in zip(moved, shifts, strict=True):
         message.pose.position.x += x
     cell.play(topics(recording, measured_pose=moved))
     answer = cell.refused('identify')
@@ -369,9 +360,7 @@ def test_outliers_are_named_by_number_and_stamp(cell, recording):
     assert f'1 outlier carries little or no weight: pose 7 ({stamp})' in cell.in_full(answer)
 
 
-def test_a_poor_identification_publishes_nothing_and_keeps_the_last_good_one(
-    unsearched, cell, recording
-):
+def test_a_poor_identification_publishes_nothing_and_keeps_the_last(unsearched, cell, recording):
     cell.play(topics(recording))
     texts = cell.listen(String, 'calibration_node/calibration')
     cell.done('identify')

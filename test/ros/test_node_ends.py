@@ -46,16 +46,14 @@ def cell_and_child(**parameters):
 
     Each child has a peer and a domain of its own: DDS takes a killed one to be alive for a while.
     """
-    reliable = {
+    qos = {
         f'qos_overrides./{topic}.subscription.reliability': 'reliable'
         for topic in ('joint_states', 'measured_pose')
     }
     with (
         Cell() as cell,
         # the probes below have no stamps
-        Child(
-            domain=cell.domain, chain='ur10e', largest_loss=1.0, **reliable, **parameters
-        ) as child,
+        Child(domain=cell.domain, chain='ur10e', largest_loss=1.0, **qos, **parameters) as child,
     ):
         reports = cell.listen(DiagnosticArray, '/diagnostics', 10)
         probes = [
@@ -73,12 +71,7 @@ def cell_and_child(**parameters):
         yield cell, child
 
 
-# Killed
-
-
-def test_a_node_killed_in_its_first_run_goes_on_with_all_its_samples(
-    monkeypatch, tmp_path, recording
-):
+def test_a_node_killed_in_its_first_run_goes_on_with_all_samples(monkeypatch, tmp_path, recording):
     monkeypatch.setenv('HOME', str(tmp_path))
     monkeypatch.delenv('ROS_HOME', raising=False)
     monkeypatch.delenv('ROS_LOG_DIR', raising=False)
@@ -172,13 +165,10 @@ def test_a_node_that_could_keep_no_samples_ends_with_one_clear_line(tmp_path, ca
         assert line.startswith(f'calibration_node: {said}')
 
 
-# A full disk
-
-
 def test_a_full_disk(tmp_path, recording):
     with cell_and_child(data_dir=tmp_path) as (cell, child):
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
-        status = cell.listen(String, '/calibration_node/status')
+        told = cell.listen(String, '/calibration_node/status')
         count = 0
 
         def play(begin, end):  # a second at a time: else joint states may overtake poses by more
@@ -205,9 +195,7 @@ def test_a_full_disk(tmp_path, recording):
             assert said in heard[-1].status[0].message
 
         level(DiagnosticStatus.ERROR, 'poses are in memory only')
-        cell.spin_until(
-            lambda: status and status[-1].data.startswith('poses are in memory only: ')
-        )
+        cell.spin_until(lambda: told and told[-1].data.startswith('poses are in memory only: '))
         assert heard[-1].status[0].message.count('in memory only') == 1
         cell.spin_until(lambda: values_of(heard[-1])['samples'] == '22')
         assert len(samples_in(tmp_path)) == 4
@@ -218,14 +206,12 @@ def test_a_full_disk(tmp_path, recording):
         unsaved = cell.refused('save')
         assert 'too large for this disk' in unsaved.message
         assert unsaved.message.endswith('write to another place')
-        assert [each.name for each in tmp_path.iterdir() if 'yaml' in each.name] == [
-            path.with_suffix('.settings.yaml').name
-        ]
+        assert [*tmp_path.glob('*yaml*')] == [path.with_suffix('.settings.yaml')]
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
         cell.spin_until(lambda: heard[-1].status[0].level != DiagnosticStatus.ERROR)
         assert 'memory' not in heard[-1].status[0].message
         assert ' poses' in heard[-1].status[0].message
-        cell.spin_until(lambda: 'memory' not in status[-1].data)
+        cell.spin_until(lambda: 'memory' not in told[-1].data)
         assert len(samples_in(tmp_path)) == STOPS
         cell.done('save')
         assert child.end(signal.SIGINT) == 0

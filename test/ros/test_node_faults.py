@@ -20,9 +20,6 @@ from calib_ros.ros.outputs import Keeper
 from calib_ros.sampling.live import LiveEstimate
 from calib_ros.sampling.session import CalibrationSession
 
-# Sources
-
-
 BROKEN = {
     'taking messages': (node_module, 'feed'),
     'the corrected pose': (Keeper, 'publish_pose'),
@@ -102,9 +99,6 @@ def test_a_source_that_dies_and_comes_back(monkeypatch, cell, recording):
     wait_for('no more messages on /joint_states')
 
 
-# Messages that do not fit
-
-
 def test_poses_in_another_frame_than_frame_id_are_dropped(tmp_path, recording):
     few = part(recording, 0.0, 5.0)
     few['measured_pose'][4].header.frame_id = 'camera'
@@ -181,9 +175,6 @@ def test_two_nodes_of_one_name_are_told(cell, tmp_path):
     cell.spin_until(lambda: len(heard) > count and said not in heard[-1].status[0].message)
 
 
-# Requests that are too large
-
-
 def test_a_list_without_end_is_refused(cell):
     for entries, said in (
         ([f'joint_{k}.a' for k in range(100_000)], 'fixed has 100000 entries; the limit is 1000'),
@@ -233,8 +224,6 @@ def test_heavy_losses_are_refused_as_in_a_bag_unless_they_are_allowed(cell, reco
     assert '25 % of the measurements were dropped' in answer.message
     cause = 'zero stamp (fill header.stamp where it is published)'
     assert f' ... {cause} ... full text: ' in answer.message
-    assert f'largest_loss (--largest-loss) 0.26, or remove the cause: {cause}' in (
-        cell.in_full(answer)
-    )
+    assert f'(--largest-loss) 0.26, or remove the cause: {cause}' in cell.in_full(answer)
     assert cell.set_parameters({'largest_loss': 0.26})[0].successful
     cell.done('identify')

@@ -57,18 +57,14 @@ def everything(folder):
 def test_other_files_are_neither_read_nor_told_of(cell, data, tmp_path):
     (data / 'out').symlink_to(tmp_path)
     (data / 'link.yaml').symlink_to(tmp_path / 'secret.yaml')
-    answers = [
-        load(cell, name)
-        for name in ('/etc/shadow', tmp_path / 'secret.yaml', 'out/secret.yaml', 'link.yaml')
-    ]
+    names = '/etc/shadow', tmp_path / 'secret.yaml', 'out/secret.yaml', 'link.yaml'
+    answers = [load(cell, name) for name in names]
     # There or not: the answer is the same.
     there, missing = (load(cell, tmp_path / name) for name in ('secret.yaml', 'missing.yaml'))
     assert there.message.replace('secret', '') == missing.message.replace('missing', '')
     for answer in (*answers, there):
         assert not answer.success
-        assert 'outside the folders of the node' in answer.message or 'must end in' in (
-            answer.message
-        )
+        assert 'outside the folders' in answer.message or 'must end in' in answer.message
     assert not any(part in answer.message for answer in answers for part in ('$6$', '19000'))
 
 
@@ -102,9 +98,7 @@ def test_files_are_written_into_the_folders_only(cell, data, tmp_path):
     for name in (tmp_path / 'x.yaml', 'out/x.yaml', 'link.yaml', 'x.csv', '.bashrc'):
         answer = save(cell, name)
         assert not answer.success, name
-        assert 'choose target_filename in data_dir' in answer.message or 'must end' in (
-            answer.message
-        )
+        assert 'choose target_filename in' in answer.message or 'must end' in answer.message
     assert everything(tmp_path) == before
     text = (data / 'good.yaml').read_text()
     for name in ('new.yaml', 'sub/new.yaml', tmp_path / 'more' / 'sub' / 'new.yaml'):

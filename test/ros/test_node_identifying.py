@@ -120,9 +120,7 @@ def test_messages_are_taken_while_a_judgement_is_filed(tmp_path, recording, monk
         (OSError(errno.ENOSPC, 'No space left', 'rows'), 'rows: the disk is full: make room'),
     ],
 )
-def test_a_result_is_told_although_its_history_fails(
-    tmp_path, recording, monkeypatch, error, said
-):
+def test_a_result_is_told_though_its_history_fails(tmp_path, recording, monkeypatch, error, said):
     """Clients of remote storage raise errors of their own: an accepted result seemed refused."""
 
     def fail(history, row):
@@ -164,9 +162,7 @@ def test_the_status_names_the_stage_of_an_identification(tmp_path, recording, st
         cell.play(topics(recording))
         running = cell.start_call('identify')
         for stage in STAGES[:2]:
-            cell.spin_until(
-                lambda now=stage: words and f'; identifying ({now}), ' in words[-1].data
-            )
+            cell.spin_until(lambda s=stage: words and f'; identifying ({s}), ' in words[-1].data)
             release.put(None)
         for _ in range(100):
             release.put(None)

@@ -89,9 +89,7 @@ def test_a_queue_that_was_full_is_told(tmp_path, recording):
         publisher = cell.publisher(JointState, 'joint_states')
         for message in joint_messages(recording)[:20]:
             publisher.publish(message)
-        cell.spin_until(
-            lambda: any('messages are lost on /joint_states' in r.status[0].message for r in heard)
-        )
+        cell.spin_until(lambda: any('lost on /joint_states' in r.status[0].message for r in heard))
         assert cell.node.session.received['joints'] < 20
         assert int(values_of(heard[-1])['queue of /joint_states full']) > 0
         cell.spin_until(lambda: 'are lost' not in heard[-1].status[0].message)
@@ -186,14 +184,8 @@ def test_a_large_share_is_told_as_lost_as_long_as_more_is():
 def test_what_dds_tells_of_losses_never_goes_below_zero():
     """A total of -2147483645 came as 18446744071562067971 once."""
     heard = inputs_module.Hearing()
-    for total, lost in (
-        (3, 3),
-        (2**64 - 2147483645, 3),
-        (2**64 - 2147483640, 8),
-        (5, 8),
-        (9, 12),
-        (9, 12),
-    ):
+    totals = 3, 2**64 - 2147483645, 2**64 - 2147483640, 5, 9, 9
+    for total, lost in zip(totals, (3, 3, 8, 8, 12, 12), strict=True):
         heard.note_lost(total)
         assert heard.lost == lost
     heard = inputs_module.Hearing()  # which goes on where it overflows
@@ -204,9 +196,7 @@ def test_what_dds_tells_of_losses_never_goes_below_zero():
 
 def test_no_executor_waits_for_the_inputs_or_their_events(cell):
     """Fast DDS wakes it for events as long as a message waits: a core would be busy."""
-    (heard,) = (
-        each for each in Node.subscriptions.fget(cell.node) if each.topic_name == '/joint_states'
-    )
+    (heard,) = (s for s in Node.subscriptions.fget(cell.node) if s.topic_name == '/joint_states')
     assert len(heard.event_handlers) == 2
     served = {*cell.node.subscriptions, *cell.node.waitables}
     assert served.isdisjoint([heard, *heard.event_handlers])

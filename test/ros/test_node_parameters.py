@@ -34,11 +34,7 @@ def test_every_parameter_is_in_the_file_with_its_default_and_an_argument_of_laun
         (content,) = yaml.safe_load(file).values()
     shipped = content['ros__parameters']
     of_every_node = ('qos_overrides.', 'start_type_description_service')
-    own = {
-        name: value
-        for name, value in declared(idle.node).items()
-        if not name.startswith(of_every_node)
-    }
+    own = {k: v for k, v in declared(idle.node).items() if not k.startswith(of_every_node)}
     assert set(own) == set(PARAMETERS) < set(launch_arguments())
     for name, value in own.items():
         default = PARAMETERS[name].default
@@ -140,10 +136,7 @@ def test_all_of_an_atomic_change_or_nothing(idle):
         ({'delay': 'none'}, 'parameter "delay" must be a finite number'),
         ({'serial': 12}, 'must be text, not 12: write it in quotes'),
         ({'model': True}, 'parameter "model" must be text, not True'),
-        (
-            {'marker_scale': 'large'},
-            'parameter "marker_scale" must be a finite number, not \'large',
-        ),
+        ({'marker_scale': 'large'}, '"marker_scale" must be a finite number, not \'large'),
         ({'resume': 1}, 'parameter "resume" must be true or false, not 1'),
         ({'folds': True}, 'parameter "folds" must be a finite number, not True'),
         ({'joint_names': [1, 2]}, 'parameter "joint_names" must be a list of strings such as ['),
@@ -241,18 +234,12 @@ def test_a_parameter_file_of_other_nodes_is_refused(tmp_path, keys, applies):
 @pytest.mark.parametrize(
     ('node', 'given', 'said'),
     [
-        (
-            '/cell_2/calibration_node',
-            'mode: triggered',
-            'but of /cell_2/calibration_node: use the',
-        ),
+        ('/cell_2/calibration_node', 'mode: triggered', 'but of /cell_2/calibration_node: use'),
         # ROS gives it no type, and rclpy no name
         ('/**', 'sources: []', "an empty list []: write [''] or leave it out"),
     ],
 )
-def test_a_parameter_file_without_effect_ends_the_node(
-    tmp_path, capsys, ended_by, node, given, said
-):
+def test_a_parameter_file_without_effect_ends_it(tmp_path, capsys, ended_by, node, given, said):
     path = tmp_path / 'parameters.yaml'
     path.write_text(f'{node}: {{ros__parameters: {{{given}}}}}')
     assert ended_by('chain:=ur10e', f'data_dir:={tmp_path}', file=path) == 1
@@ -267,10 +254,7 @@ def test_the_parameter_file_applies_under_a_namespace(tmp_path):
     path.write_text(text)
     words = ('--params-file', str(path), '-r', '__ns:=/cell_2', '-r', '__node:=arm')
     given = {'serial': '0012', 'data_dir': tmp_path, 'command': ('-m', 'calib_ros.ros.node')}
-    with (
-        Cell() as cell,
-        Child(*words, domain=cell.domain, **given) as child,
-    ):
+    with Cell() as cell, Child(*words, domain=cell.domain, **given) as child:
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
         assert 'cell_2.arm' in child.wait_for('ready to calibrate meca500')
         cell.spin_until(lambda: heard)

@@ -23,15 +23,13 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
     parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': 'A7'}
     with Cell(**parameters) as cell:
         diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
-        corrected = cell.listen(PoseStamped, 'calibration_node/corrected_pose', 10)
+        heard = cell.listen(PoseStamped, 'calibration_node/corrected_pose', 10)
         begun = time.monotonic()
         cell.play(topics(recording, joint_states=doubled))
         cell.done('identify')
         cell.play({'joint_states': joints[-1:]})
-        cell.spin_until(
-            lambda: [m for m in corrected if m.header.stamp == joints[-1].header.stamp]
-        )
-        message = corrected[-1]
+        cell.spin_until(lambda: [m for m in heard if m.header.stamp == joints[-1].header.stamp])
+        message = heard[-1]
         assert message.header.frame_id == 'tracker'
         true = truth.forward(recording.joints[-1:])[0, :3, 3]
         point = message.pose.position
@@ -51,9 +49,7 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
         assert 'enough for the accuracy wanted' in words[-1].data
 
 
-def test_the_status_is_short_and_its_first_words_are_those_that_matter(
-    monkeypatch, cell, recording
-):
+def test_the_status_is_short_and_its_first_words_matter(monkeypatch, cell, recording):
     """The rest is in the diagnostics; `ros2 topic echo` cuts texts at 128 characters."""
     words = cell.listen(String, 'calibration_node/status')
     long = '; '.join(['the arm is moving', *(f'sample {k} of many words' for k in range(20))])
@@ -72,10 +68,8 @@ def test_the_status_is_short_and_its_first_words_are_those_that_matter(
 
 def test_residuals_of_all_devices_are_drawn_in_one_frame(tmp_path, recording, truth):
     there = replace(truth, base=random_frame(np.random.default_rng(8), 2.0))
-    joints = recording.poses.joints
-    other = measure(there, joints, np.random.default_rng(9), 2e-5, 1e-4).at(
-        recording.poses.stamps_ns
-    )
+    poses, rng = recording.poses, np.random.default_rng(9)
+    other = measure(there, poses.joints, rng, 2e-5, 1e-4).at(poses.stamps_ns)
     sources = ['measured_pose', 'other device=B']
     with Cell(chain='ur10e', data_dir=str(tmp_path), sources=sources) as cell:
         some = pose_messages(other, frame_id='elsewhere')
