@@ -136,9 +136,7 @@ TOLERANCES = {'*.a': 5e-4, '*.d': 5e-4, '*.alpha': 1e-3, '*.theta': 1e-3, '*.bet
 @pytest.mark.parametrize(
     ('oriented', 'count', 'share'), [(True, 6, 0.4), (False, 8, 0.5), (False, 10, 0.2)]
 )
-def test_few_poses_and_manufacturing_tolerances_are_judged_by_leaving_out_one(
-    oriented, count, share
-):
+def test_few_poses_and_tolerances_are_judged_by_leaving_out_one(oriented, count, share):
     """Six poses hold as many equations as needed without priors and none to judge by.
 
     One arm's lengths err alike by chance, as a device that is out of scale makes them.
@@ -198,10 +196,7 @@ def test_a_gross_error_that_the_correction_makes_larger_by_chance_spoils_nothing
         (None, ()),
         (('shoulder_lift_joint', 'elbow_joint'), ()),
         (('elbow_joint',), ('omits shoulder_lift_joint, but', 'connected there are par')),
-        (
-            ('elbow_joint', 'wrist_1_joint'),
-            ('omits shoulder_lift', 'has wrist_1_joint', 'not par'),
-        ),
+        (('elbow_joint', 'wrist_1_joint'), ('omits shoulder_lift', 'has wrist_1', 'not par')),
     ],
 )
 def test_a_chain_that_lists_the_wrong_axes_as_parallel_is_named(parallel, words):

@@ -27,10 +27,7 @@ def test_targets_of_one_stop_are_one_configuration(rng):
     q = UR10E.random_joints(20, rng)
     first = measure(true, q, rng, *NOISE)
     second = replace(measure(true, q[5:], rng, *NOISE), tool='tool_B')
-    assert [each.tolist() for each in numbered((first, second))] == [
-        list(range(20)),
-        list(range(5, 20)),
-    ]
+    assert [each.tolist() for each in numbered((first, second))] == [[*range(20)], [*range(5, 20)]]
     result = identify(Problem(UR10E, first, more=(second,), **SIGMAS))
     assert result.validated_by == '5-fold cross-validation over 20 different poses'
     assert result.validation.after.configurations.tolist() == [*range(20), *range(5, 20)]

@@ -136,9 +136,8 @@ def test_a_source_that_repeats_its_last_value_is_named(part, rows_of):
     of_messages = rows_of == 'poses'  # of a simulation, with stamps of whole seconds
     result = identify(Problem(UR10E, replace(seen, **held), of_messages=of_messages))
     assert not result.accepted
-    assert f'the {part} repeated in {rows_of} 9 to 30 while the rest moved' in ' '.join(
-        map(str, result.refusals)
-    )
+    said = ' '.join(map(str, result.refusals))
+    assert f'the {part} repeated in {rows_of} 9 to 30 while the rest moved' in said
 
 
 @pytest.mark.parametrize('size', [1e3, 1e-3])
@@ -150,8 +149,7 @@ def test_one_coordinate_in_another_unit_is_named(size):
 
 
 @pytest.mark.parametrize(
-    ('axes', 'option'),
-    [([1, 0, 2], 'x=y,y=x,z=z'), ([2, 1, 0], 'x=z,y=y,z=x')],
+    ('axes', 'option'), [([1, 0, 2], 'x=y,y=x,z=z'), ([2, 1, 0], 'x=z,y=y,z=x')]
 )
 def test_coordinates_of_the_positions_alone_in_another_order_are_named(axes, option):
     seen = seen_of(30, True)
@@ -183,9 +181,7 @@ def test_the_zero_of_a_draw_wire_is_named(zero):
     lengths = np.linalg.norm(seen.positions, axis=1) + zero
     result = identify(Problem(UR10E, replace(seen, distances=lengths)))
     way = 'long' if zero > 0.0 else 'short'
-    found = re.search(
-        rf'distances are ([0-9.]+) mm too {way}', ' '.join(map(str, result.refusals))
-    )
+    found = re.search(rf'distances are (\S+) mm too {way}', ' '.join(map(str, result.refusals)))
     assert (found is not None) is bool(zero)
     assert not zero or float(found[1]) == pytest.approx(1e3 * abs(zero), abs=0.5)
 
@@ -194,9 +190,7 @@ def test_the_zero_of_a_draw_wire_is_named(zero):
 def test_a_sag_that_looks_like_the_zero_of_a_draw_wire_is_not_taken_for_it(seed):
     tx90 = load_chain('staubli_tx90l')
     rng, names = np.random.default_rng(seed), tx90.joint_names
-    bends = dict.fromkeys(
-        [f'{names[1]}.gravity_{names[2]}', f'{names[1]}.gravity_{names[5]}'], 3e-4
-    )
+    bends = dict.fromkeys([f'{names[1]}.gravity_{names[k]}' for k in (2, 5)], 3e-4)
     bends[f'{names[2]}.gravity_{names[4]}'] = 3e-4
     true = faulty(tx90, Cell(), rng).with_effect_values(bends)
     seen = measure(true, tx90.random_joints(60, rng), rng, 3e-5, oriented=False)

@@ -31,9 +31,7 @@ def joints(change):
 
 
 def turned(order):
-    return lambda each: replace(
-        each, rotations=se3.from_quat(se3.to_quat(each.rotations)[:, order])
-    )
+    return lambda e: replace(e, rotations=se3.from_quat(se3.to_quat(e.rotations)[:, order]))
 
 
 def later(each):

@@ -43,12 +43,8 @@ def test_a_joint_that_only_goes_one_way_is_named():
     steady = seen.select(np.argsort(seen.joints[:, 2]))
     joints = steady.joints.copy()
     joints[:, 4] = np.sort(joints[:, 4])
-    several = measure(arm(0), joints, np.random.default_rng(0), 5e-5, 2e-4)
-    for one, named in (
-        (seen, ''),
-        (steady, 'elbow_joint'),
-        (several, 'elbow_joint, wrist_2_joint'),
-    ):
+    both = measure(arm(0), joints, np.random.default_rng(0), 5e-5, 2e-4)
+    for one, named in ((seen, ''), (steady, 'elbow_joint'), (both, 'elbow_joint, wrist_2_joint')):
         said = [each for each in identify(Problem(UR, one)).remarks if 'mix' in each]
         assert len(said) == bool(named)
         assert all(f'an error of {named}, moved in one direction' in each for each in said)
@@ -90,9 +86,7 @@ def test_the_share_explained_is_that_of_least_squares():
     chain = replace(UR, base=true.base, tool=true.tool).with_effects(added)
     names = [name for name in UR.parameter_names if UR.owns_frame(name)]
     rows = stacked(problem.system(problem.sets).rows_of(chain, [*names, *added]))
-    fewer, more = (
-        np.linalg.lstsq(rows[:, :count], rows[:, -1])[1][0] for count in (len(names), -1)
-    )
+    fewer, more = (np.linalg.lstsq(rows[:, :k], rows[:, -1])[1][0] for k in (len(names), -1))
     found = explained_share(problem, chain, names, added)
     assert found == pytest.approx(1.0 - more / fewer, rel=1e-6)
     assert 0.1 < found < 0.9
@@ -292,9 +286,7 @@ def test_two_lengths_may_grow_alike_but_not_all_of_many(chain):
     """A SCARA with links 0.6 % too long was refused, though the scale of the tracker was known."""
     rng = np.random.default_rng(2)
     true = faulty(chain, Cell(length_error=1e-4), rng)
-    longer = {
-        name: chain.value(name) for name in chain.parameter_names if name[-2:] in ('.a', '.d')
-    }
+    longer = {n: chain.value(n) for n in chain.parameter_names if n[-2:] in ('.a', '.d')}
     true = true.with_offsets({name: 6e-3 * chain.value(name) for name in longer})
     seen = measure(true, chain.random_joints(40, rng), rng, *NOISE)
     for sigma, refused in ((1e-5, chain is UR), (0.02, False)):

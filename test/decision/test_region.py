@@ -183,9 +183,7 @@ def test_a_coupling_that_hardly_shows_near_a_posture_is_not_fitted_for_elsewhere
 
 
 @pytest.mark.parametrize(('near', 'inside'), [(0.3, 0.0), (0.0, 0.3)])
-def test_the_risk_is_the_larger_one_of_the_poses_and_of_those_known_as_well(
-    local, near, inside, monkeypatch
-):
+def test_the_risk_is_the_larger_of_poses_and_those_known_as_well(local, near, inside, monkeypatch):
     """That by the scale of the device counts as far as a scale is likely, in log odds."""
     sets, sizes = [measured(arm(0), UR10E.random_joints(60, np.random.default_rng(0)))], []
     posterior = replace(local.posterior, rival=None)

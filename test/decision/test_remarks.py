@@ -128,9 +128,7 @@ def test_no_lag_is_sought_in_motion_images_or_what_is_explained(change):
     ],
 )
 def test_orientations_outweigh_positions_that_are_as_stated(position, orientation, told):
-    poses = Observations.from_arrays(
-        np.zeros((4, 6)), np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1))
-    )
+    poses = Observations.from_arrays(np.zeros((4, 6)), np.zeros((4, 3)), [np.eye(3)] * 4)
     problem = Problem(UR, poses, sigma_position=1e-4, sigma_orientation=3e-4)
     noise = SimpleNamespace(consistent=False, position=position, orientation=orientation)
     result = SimpleNamespace(noise=noise, validation=None)
@@ -155,9 +153,7 @@ def test_orientations_outweigh_positions_that_are_as_stated(position, orientatio
         (1.0, {'count': 7}, 'explain 100 %'),
     ],
 )
-def test_a_lens_explains_what_is_left_by_the_freedoms_of_the_images(
-    share, change, told, monkeypatch
-):
+def test_a_lens_explains_by_the_freedoms_of_the_images(share, change, told, monkeypatch):
     given = {'imitates': False, 'converged': True, 'step': None, 'count': 20} | change
     monkeypatch.setattr(plausibility, 'explained_share', lambda *_: share)
     monkeypatch.setattr(plausibility, '_imitated', lambda *_: given['imitates'])
@@ -218,8 +214,5 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
         another,
     )
     assert list(result.refusals) == refused
-    assert [each for each in result.remarks if each != plausibility.COUPLED] == [
-        'first',
-        *remarked,
-    ]
+    assert [e for e in result.remarks if e != plausibility.COUPLED] == ['first', *remarked]
     assert (plausibility.COUPLED in result.remarks) == ('coupled' in found)

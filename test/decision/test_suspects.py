@@ -182,9 +182,7 @@ def quaternions(order):
         ),
     ],
 )
-def test_ways_to_write_a_pose_are_undone_in_the_poses_as_they_were_measured(
-    what, written, inverse, rng
-):
+def test_ways_to_write_a_pose_are_undone_in_the_poses_as_measured(what, written, inverse, rng):
     """Also with other units; those of a camera on the flange are inverted before and after."""
     arm = load_chain('ur10e')
     seen = measure(arm, arm.random_joints(9, rng), rng)
@@ -217,9 +215,7 @@ def test_ways_to_write_a_pose_are_undone_in_the_poses_as_they_were_measured(
         ('the coordinates x, y, z of the positions are -x, y, z', np.diag([-1.0, 1.0, 1.0])),
     ],
 )
-def test_what_is_wrong_with_coordinates_is_undone_as_they_were_measured(
-    what, matrix, inverse, rng
-):
+def test_what_is_wrong_with_coordinates_is_undone_as_measured(what, matrix, inverse, rng):
     arm = load_chain('ur10e')
     seen = measure(arm, arm.random_joints(9, rng), rng)
     spoilt = replace(seen, positions=seen.positions @ matrix.T)

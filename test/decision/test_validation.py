@@ -143,13 +143,9 @@ def test_intervals_are_students_and_limits_are_those_of_their_kind():
     assert few.half_width() == pytest.approx(2.0 * stats.t.ppf(0.975, 5), rel=1e-9)
     assert few.half_width(0.5) == pytest.approx(2.0 * stats.t.ppf(0.75, 5), rel=1e-9)
     assert row('a', 0.0, None).half_width() is None
-    for name, beyond in (
-        ('a', (True, False)),
-        ('theta', (False, True)),
-        ('ratio', (False, False)),
-    ):
+    for name, far in (('a', (True, False)), ('theta', (False, True)), ('ratio', (False, False))):
         limits = ((0.4, 0.6), (0.6, 0.4))
-        assert tuple(row(name, -0.5, 0.01).beyond(*each) for each in limits) == beyond
+        assert tuple(row(name, -0.5, 0.01).beyond(*each) for each in limits) == far
     assert row('a', 0.5, 0.09).beyond(0.2, 1.0)
     assert not row('a', 0.5, 0.11).beyond(0.2, 1.0)  # three deviations reach it
     assert not row('a', 0.5, None).beyond(0.2, 1.0)
