@@ -126,13 +126,15 @@ def test_what_follows_the_joints_is_no_step(design, count):
         assert identify(Problem(UR10E, seen, **SIGMAS)).step is None
 
 
-def test_a_dozen_positions_show_no_step():
+def test_a_dozen_positions_show_a_bump_and_nothing_else():
     """A step of the base may spare priors more squares than nine degrees of freedom leave."""
     for seed in (2, 3, 16, 18, 24):
         rng = np.random.default_rng(seed)
         true = faulty(UR10E, Cell(), rng)
         seen = measure(true, UR10E.random_joints(12, rng), rng, *NOISE, oriented=False)
         assert identify(Problem(UR10E, seen, **SIGMAS)).step is None
+        bumped = Problem(UR10E, moved(seen, true, 'tool', 5e-3, at=6), **SIGMAS)
+        assert abs(find_step(fitting.fit(bumped)[2]).sample - 6) <= 1
 
 
 @pytest.mark.parametrize(('slip', 'found'), [(0.0, None), (2e-3, UR10E.joint_names[2])])
