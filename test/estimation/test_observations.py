@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib_ros.errors import InputError
-from calib_ros.estimation.configurations import STILL, configurations
+from calib_ros.estimation.configurations import SCATTER, STILL, configurations
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics import se3
 
@@ -134,6 +134,13 @@ def test_select_takes_optional_arrays_along(rng):
     part = seen.select(np.array([3, 1]))
     for name in ('velocity', 'acceleration', 'delay'):
         np.testing.assert_array_equal(getattr(part, name), getattr(seen, name)[[3, 1]])
+
+
+def test_poses_ever_further_apart_are_no_visits_of_one_configuration():
+    """No distance tells where those of one end and those of two begin."""
+    joints = np.repeat(np.arange(20.0) / 4.0, 2)[:, np.newaxis]
+    joints[1::2, 0] += 0.2 * SCATTER * 1.13 ** np.arange(20)  # up to twice SCATTER
+    assert len(np.unique(configurations(joints))) == 40
 
 
 def test_a_part_keeps_the_configurations_of_the_whole(rng):
