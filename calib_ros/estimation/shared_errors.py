@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors shared by neighbouring poses, which then carry less information than their number.
+"""Errors shared by neighbouring poses.
 
-Configurations are neighbours in succession or in joint space. Residuals r of white noise of unit
-variance have the covariance B = I - Q Q^T (Q: orthonormal columns of the Jacobian), so a quadratic
-form r^T A r has
+A tracker drifts, and model errors change slowly over the joint space, so neighbours have similar
+errors and carry less information than their number. Configurations are neighbours in succession or
+in joint space. Residuals r of white noise of unit variance have the covariance B = I - Q Q^T (Q:
+orthonormal columns of the Jacobian), so a quadratic form r^T A r has
 
     mean tr(A B)        covariance with r^T C r: 2 tr(A B C B)
 
@@ -14,8 +15,9 @@ neighbours, the noise is modelled as a sum of independent and fading parts,
 
     V = v_0 I + sum_k v_k K_k        K_k = exp(-distance / length_k)
 
-where the sizes v_k >= 0 equate the forms r^T K_k r with their expected values (MINQUE, Rao 1971).
-The covariance of the parameters is then H^-1 (J^T V J) H^-1.
+where the sizes v_k >= 0 equate the forms r^T K_k r with their expected values (MINQUE, Rao 1971),
+which allows for errors absorbed by the fit. The covariance of the parameters is then
+H^-1 (J^T V J) H^-1.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy import linalg, special
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
@@ -34,7 +37,7 @@ from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, Index, cos_sin
 from calib_ros.values import LARGEST
 
 DECAYS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
@@ -81,8 +84,8 @@ class Stops:
     def __len__(self) -> int:
         return len(self.count)
 
-    def links(self, kind: str) -> FloatArray:
-        """Return (n, n): 1 for neighbours, else 0."""
+    def links(self, kind: str) -> csr_array:
+        """Return (n, n): 1 for neighbours."""
         count = len(self)
         if kind == 'successive':
             first = np.flatnonzero(np.diff(self.time) == 1.0)
@@ -92,8 +95,9 @@ class Stops:
             first, second = np.repeat(np.arange(count), NEARBY + 1), nearest.ravel()
             good = (first != second) & (far.ravel() < ELSEWHERE / 2)
             first, second = first[good], second[good]
-        links = np.zeros((count, count))
-        links[first, second] = links[second, first] = 1.0
+        ends = (np.append(first, second), np.append(second, first))
+        links = csr_array((np.ones(2 * len(first)), ends), shape=(count, count))
+        links.data[:] = 1.0
         return links
 
     def kernel(self, kind: str, length: float) -> FloatArray:
@@ -118,9 +122,10 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     forms = _Forms(few, extra)
     limit = special.ndtri(1.0 - (1.0 - CERTAIN) / (len(kinds) * len(forms.parts)))
     alike: dict[int, list[str]] = {}
-    links = [few.links(kind) for kind in kinds]
-    for part in forms.parts:
-        for kind, (correlation, score) in zip(kinds, forms.test(part, links), strict=True):
+    for kind in kinds:
+        links = few.links(kind)
+        for part in forms.parts:
+            correlation, score = forms.test(part, links)
             correlations[kind] = max(correlations[kind], correlation)
             if score > limit:
                 alike.setdefault(part, []).append(kind)
@@ -162,6 +167,7 @@ class _Forms:
         self._basis: dict[int, FloatArray] = {}
         self._residual: dict[int, FloatArray] = {}
         self._known: dict[int, FloatArray] = {}
+        self._white: dict[int, FloatArray] = {}
         self.parts: list[int] = []
         first = 0
         for part, each in enumerate(units.parts):
@@ -174,6 +180,7 @@ class _Forms:
             self._basis[part] = np.ascontiguousarray(turned)
             self._residual[part] = left[block].reshape(shape).T
             self._known[part] = each.any(axis=0).T.astype(float)
+            self._white[part] = gram(basis[block].T)
             self.parts.append(part)
 
     def _moments(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
@@ -181,15 +188,14 @@ class _Forms:
         inner, alone = list[FloatArray](), list[FloatArray]()
         for part, own in matrices.items():
             basis, known, count = self._basis[part], self._known[part], len(own)
-            width = basis.shape[2]
-            crossed, traces = np.zeros((count, width, width)), np.zeros((count, count))
+            crossed, traces = np.zeros((count, basis.shape[2] ** 2)), np.zeros((count, count))
             for seen in np.unique(known, axis=1).T:
-                rows = basis[:, (known == seen[:, np.newaxis]).all(axis=0)]
+                alike = (known == seen[:, np.newaxis]).all(axis=0)
                 both = own * np.outer(seen, seen)
-                spread = (both @ rows.reshape(len(rows), -1)).reshape(count, -1, width)
-                crossed += rows.reshape(-1, width).T @ spread
-                traces += rows.shape[1] * gram(both) - 2.0 * gram(spread)
-            inner.append(crossed.reshape(count, -1))
+                more, common = _crossed(basis[:, alike], own, both)
+                crossed += more.reshape(count, -1)
+                traces += alike.sum() * gram(both) - 2.0 * common
+            inner.append(crossed)
             alone.append(traces)
         return np.asarray(gram(np.concatenate(inner)) + linalg.block_diag(*alone))
 
@@ -198,25 +204,25 @@ class _Forms:
         pairs = [(self._residual[part], own) for part, own in matrices.items()]
         return np.concatenate([(r * (own @ r)).sum(axis=(1, 2)) for r, own in pairs])
 
-    def test(self, part: int, links: Sequence[FloatArray]) -> list[tuple[float, float]]:
-        """Return excess correlations of residuals by kinds of links, and scores: N(0, 1) for none.
-
-        For links (n, n) of each kind.
-        """
-        basis, known, found = self._basis[part], self._known[part], []
-        matrices = {part: np.array([np.eye(len(known)), *links])}
-        moments, (size, *values) = self._moments(matrices), self._values(matrices).tolist()
-        freedom = float(known.sum() - (basis**2).sum())
-        for k, (each, form) in enumerate(zip(links, values, strict=True), 1):
-            pairs = float((known * (each @ known)).sum())
-            excess, variance = 0.0, 1.0
-            if size > 0.0 and pairs > 0.0 and freedom > 1.5:  # one alone has a constant ratio
-                ratio = -float((basis * np.tensordot(each, basis, 1)).sum()) / freedom
-                along, own = np.array([-ratio, 1.0]), np.ix_([0, k], [0, k])
-                variance = 2.0 * max(float(along @ moments[own] @ along), 1e-300)
-                excess = form * freedom / size - ratio * freedom
-            found.append((excess / max(pairs, 1.0), excess / float(np.sqrt(variance))))
-        return found
+    def test(self, part: int, links: csr_array) -> tuple[float, float]:
+        """Return the excess correlation of linked residuals and its score, N(0, 1) for none."""
+        basis, residual, known = self._basis[part], self._residual[part], self._known[part]
+        product = (links @ basis.reshape(len(basis), -1)).reshape(basis.shape)
+        product *= known[:, :, np.newaxis]
+        white = self._white[part]
+        linked = basis.reshape(-1, len(white)).T @ product.reshape(-1, len(white))
+        pairs = float((known * (links @ known)).sum())
+        size = float((residual**2).sum())
+        freedom = float(known.sum() - np.trace(white))
+        if not (size > 0.0 and pairs > 0.0 and freedom > 1.5):  # one alone has a constant ratio
+            return 0.0, 0.0
+        ratio = -float(np.trace(linked)) / freedom
+        both = float((linked**2).sum() + pairs - 2.0 * (product**2).sum())
+        mixed = float((linked * white).sum() - 2.0 * (product * basis).sum())
+        alone = float((white**2).sum() + known.sum() - 2.0 * (basis**2).sum())
+        variance = 2.0 * max(both - 2.0 * ratio * mixed + ratio**2 * alone, 1e-300)
+        excess = float((residual * (links @ residual)).sum()) * freedom / size - ratio * freedom
+        return excess / pairs, excess / float(np.sqrt(variance))
 
     def sizes(self, kernels: dict[int, list[tuple[str, float]]]) -> dict[int, FloatArray]:
         """Return, by part, the sizes (1 + K,) of the independent part and each kernel."""
@@ -246,6 +252,31 @@ def nonnegative(moments: FloatArray, values: FloatArray) -> FloatArray:
     along = (values / scale) @ directions / roots
     sizes = optimize.nnls(roots[:, np.newaxis] * directions.T, along)[0]
     return np.asarray(sizes / scale)
+
+
+def _crossed(
+    basis: FloatArray, own: FloatArray, both: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return Q^T A Q (K, P, P) of columns Q (n, c, P), and the traces (K, K) tr(A C Q Q^T).
+
+    Of matrices A (K, n, n), the first of which is the identity, and, for the traces, those between
+    the rows that were measured.
+    """
+    columns, rows = basis.reshape(len(basis), -1), basis.reshape(-1, basis.shape[2])
+    if columns.shape[1] <= len(columns):
+        spread = both @ columns
+        return rows.T @ spread.reshape(-1, *rows.shape), gram(spread)
+    crossed = [each.T @ each for each in (rows, *(_rooted(basis, each) for each in own[1:]))]
+    spread = both @ (columns @ columns.T)
+    return np.array(crossed), spread.reshape(len(both), -1) @ both.reshape(len(both), -1).T
+
+
+def _rooted(basis: FloatArray, matrix: FloatArray) -> FloatArray:
+    """Return C^T Q (n c, P) of columns Q (n, c, P), with C C^T the positive matrix (n, n)."""
+    size = len(matrix)
+    root = np.linalg.cholesky(matrix + ROUNDING * np.diag(np.diag(matrix)))
+    turned = linalg.blas.dtrmm(1.0, root.T, basis.reshape(size, -1).T, side=1, trans_a=1)
+    return np.asarray(turned.T.reshape(-1, basis.shape[2]))
 
 
 def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> tuple[Stops, int]:
@@ -315,32 +346,39 @@ def _successive(
     """Return by part J^T K J of errors fading in succession, for (length, size) each."""
     found = {part: np.zeros((len(names), len(names))) for part in kernels}
     for samples in system.sets if kernels else ():
-        past, last = dict[int, FloatArray](), -1
+        past, last = dict[int, FloatArray](), 0
         for numbers, sums in samples.sums(chain, names, samples.observations.stops):
             for part in kernels.keys() & range(len(sums)):
                 rows, own = sums[part][:-1], kernels[part]
-                before = past.get(part, np.zeros((len(own), *rows.shape[:2])))
-                products, past[part] = _fading(rows, own, before, int(numbers[0]) - last)
+                products, past[part] = _fading(rows, numbers - last, own, past.get(part))
                 found[part] += products
             last = int(numbers[-1])
     return found
 
 
 def _fading(
-    rows: FloatArray, kernels: Sequence[tuple[float, float]], before: FloatArray, first: int
+    rows: FloatArray,
+    time: Index,
+    kernels: Sequence[tuple[float, float]],
+    before: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return J^T K J of rows (P, c, n) of successive stops, and their faded sums (K, P, c).
+    """Return J^T K J of rows (P, c, n) of stops at times (n,), and their faded sums (P c, K).
 
-    `before` are the sums up to `first` stops before: none if one stop spans two blocks.
+    Runs of stops are multiplied with a root of the sum of K kernels, and with what is left of all
+    stops before: their sums, `before` those at time zero.
     """
-    past, mixed = np.empty_like(before), np.zeros_like(rows)
-    for k, (length, size) in enumerate(kernels):
-        fade = np.exp(-1.0 / length)
-        added = rows.copy()
-        added[..., 0] += fade**first * before[k]
-        faded = np.multiply.outer([1.0, -fade], np.ones(rows.shape[2]))  # y_t - fade y_t-1 = x_t
-        sums = linalg.solve_banded((1, 0), faded, added.reshape(-1, rows.shape[2]).T)
-        past[k] = sums[-1].reshape(before[k].shape)
-        mixed += size * sums.T.reshape(rows.shape)
-    cross = rows.reshape(len(rows), -1) @ mixed.reshape(len(rows), -1).T
-    return cross + cross.T - sum(size for _, size in kernels) * gram(rows), past
+    lengths, sizes = np.transpose(kernels)
+    flat, last = rows.reshape(-1, len(time)), 0
+    past = [np.zeros((len(flat), len(sizes))) if before is None else before]
+    turned, here = np.empty_like(flat), []
+    for first in range(0, len(time), SOME_POSES // 4):
+        run = np.s_[first : first + SOME_POSES // 4]
+        then, own = time[run, np.newaxis], flat[:, run]
+        fade = np.exp(-np.abs(then - time[run])[..., np.newaxis] / lengths)
+        turned[:, run] = own @ np.linalg.cholesky(fade @ sizes)
+        here.append(own @ (np.exp((last - then) / lengths) * sizes))
+        past.append(past[-1] * np.exp((last - then[-1]) / lengths) + own @ fade[-1])
+        last = int(then[-1, 0])
+    one, other = (np.concatenate(x, axis=1).reshape(len(rows), -1) for x in (here, past[:-1]))
+    cross = one @ other.T
+    return gram(turned.reshape(len(rows), -1)) + cross + cross.T, past[-1]

@@ -149,7 +149,7 @@ def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
     found = forms._moments(dict.fromkeys((0, 1), matrices))
     np.testing.assert_allclose(found, expected, atol=1e-9)
     links = units.links('successive')
-    dense = whole(1, links)
+    dense = whole(1, links.toarray())
     free = left[60:, 60:]
     ratio = np.trace(dense @ left) / np.trace(free)
     centred = dense @ left - ratio * whole(1, np.eye(count)) @ left
@@ -158,7 +158,7 @@ def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
     excess *= np.trace(free) / (residual[60:] ** 2).sum()
     score = excess / np.sqrt(2.0 * np.trace(centred @ centred))
     pairs = measured.astype(float) @ dense @ measured
-    assert forms.test(1, [links]) == [pytest.approx((excess / pairs, score), rel=1e-9)]
+    assert forms.test(1, links) == pytest.approx((excess / pairs, score), rel=1e-9)
 
 
 def test_where_no_more_was_measured_than_fitted_nothing_is_shared():
@@ -170,7 +170,7 @@ def test_where_no_more_was_measured_than_fitted_nothing_is_shared():
         parts = [rng.normal(size=(2 * count, 2, count)), np.zeros((2 * count, 3, count))]
         units = shared_errors.Stops(parts, np.ones(count), place, time, place)
         forms = shared_errors._Forms(units, np.zeros((0, 2 * count - 1)))
-        assert forms.test(0, [units.links('near')]) == [(0.0, 0.0)]
+        assert forms.test(0, units.links('near')) == (0.0, 0.0)
         sizes = forms.sizes({0: kernels})[0]
         assert np.isfinite(sizes).all()
         assert (sizes >= 0.0).all()
@@ -192,9 +192,9 @@ def test_neighbours_are_the_next_stop_and_the_three_nearest():
     expected = np.maximum(expected, expected.T)
     assert expected[:11, 11:].any()  # the third nearest of a set of three is in the other one
     expected[:11, 11:] = expected[11:, :11] = 0.0
-    np.testing.assert_array_equal(units.links('near'), expected)
+    np.testing.assert_array_equal(units.links('near').toarray(), expected)
     follows = np.abs(np.subtract.outer(time, time)) == 1.0
-    np.testing.assert_array_equal(units.links('successive'), follows)
+    np.testing.assert_array_equal(units.links('successive').toarray(), follows)
     for kind, distance in (('near', apart), ('successive', np.abs(np.subtract.outer(time, time)))):
         root = np.sqrt(np.outer(units.count, units.count))
         np.testing.assert_allclose(units.kernel(kind, 0.7), root * np.exp(-distance / 0.7))
@@ -309,7 +309,7 @@ def test_where_nothing_is_left_nothing_is_shared():
     for part in units.parts:
         part[-1] = 0.0
     forms = shared_errors._Forms(units, np.zeros((0, 4)))
-    assert forms.test(0, [units.links('near')]) == [(0.0, 0.0)]
+    assert forms.test(0, units.links('near')) == (0.0, 0.0)
 
 
 def test_too_few_stops_share_nothing():
@@ -335,14 +335,13 @@ def test_the_middle_is_the_sum_of_all_that_a_test_finds(most, monkeypatch):
     scores = {('successive', 0): limit + 1e-6, ('near', 0): 9.0, ('near', 1): limit - 1e-6}
     scores |= {('successive', 1): 9.0}
     share = 1 if most > 24 else 2  # every second one of 24 stops, at most 20
+    kinds = iter(['successive'] * 2 + ['near'] * 2)
     sizes = {0: np.array([2.0, 0, 0, 0.3, 0, 0, 0, 0.0, 0.7]), 1: np.zeros(6)}
 
     def test(forms, part, _):
         assert forms._units.time.tolist() == [*range(0, 24, share)]
-        return [
-            (0.1 * (1 + part) * sign, scores[kind, part])
-            for kind, sign in (('successive', -1), ('near', 1))
-        ]
+        kind = next(kinds)
+        return 0.1 * (1 + part) * (1 if kind == 'near' else -1), scores[kind, part]
 
     def sized(_, kernels):
         successive = [('successive', length) for length in (1.0, 3.0, 10.0, 30.0, 100.0)]
