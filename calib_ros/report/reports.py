@@ -55,7 +55,8 @@ def identification_report(
     reasons = advice_of(result)
     text = filter(None, _text(result, reasons, tolerance))
     gain = sections.gain(judged) if result.accepted else ''
-    effects = words.notes(result)[:1] if result.chain.effects else []
+    fitted = [counted(result.rank, 'parameter')]
+    fitted += words.notes(result)[:1] if result.chain.effects else []
     scale = f'scale checked to {1e6 * problem.sigma_scale:g} ppm'
     scale = scale if problem.sigma_scale else 'scale not checked'
     corrected, notes = 'none: not accepted', words.other_remarks(result)
@@ -86,8 +87,7 @@ def identification_report(
             origin,
             poses,
             (
-                ('Fitted', ', '.join((counted(result.rank, 'parameter'), *effects))),
-                ('Fitted to', words.fitted_to(result)),
+                ('Fitted', f'{", ".join(fitted)} to {words.fitted_to(result)}'),
                 ('Stated device noise', f'{_stated(problem, poses)}; one sigma; {scale}'),
                 ('Remaining error', words.times_in_words(result.noise)),
                 ('Judged by', result.validated_by),
