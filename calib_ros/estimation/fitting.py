@@ -109,7 +109,7 @@ def _fit_all(
         size = min(size, _likely_noise(fitted))
     posterior = posterior_of(fitted, size, judging=False)
     told = (posterior.held(n) <= 1.0 - CONFIDENT for n in names if n not in problem.given)
-    if problem.learned is None and all(told):
+    if problem.learned is None and not problem.model.effects and all(told):
         return fitted  # the priors found would not change the fit
     for _ in range(ROUNDS):
         priors = {
