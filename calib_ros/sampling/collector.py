@@ -49,6 +49,7 @@ class Collector:
         self._advanced_ns = 0  # the same at the last round
         self._settled_ns = 0  # measurements before this are settled
         self._sampled_ns = 0  # a stop at this moment has been sampled
+        self._since_ns = 0  # begin of the stop that goes on
         self.rests = Rests(settings.pose_buffer)
         self.unmeasured = 0  # stops without a measurement since the last one with any
         self._backwards = 0
@@ -225,7 +226,7 @@ class Collector:
             return 1, ''
         self._round(begin)  # end earlier stops
         before, dropped = len(self.sampler.fresh), self.dropped.copy()
-        plan = Schedule(self._settled_ns, self._sampled_ns)
+        plan = Schedule(self._settled_ns, self._sampled_ns, self._since_ns)
         plan.add(newest, '', begin + round(self.settings.settle * 1e9))
         self._carry_out(plan)
         count = len(self.sampler.fresh) - before
@@ -249,7 +250,7 @@ class Collector:
         self._sort()
         if until <= self._settled_ns:
             return
-        plan = Schedule(self._settled_ns, self._sampled_ns)
+        plan = Schedule(self._settled_ns, self._sampled_ns, self._since_ns)
         if self.settings.mode == 'continuous':
             for end in (*(each - self._late_ns for each in rounds[:-1]), until):
                 plan.add(min(end, until), '')
@@ -257,6 +258,7 @@ class Collector:
             self._plan_stops(plan, until, rounds or (self.track.newest_ns,), ends_here)
         self._carry_out(plan)
         self._sampled_ns, self._settled_ns = plan.sampled_ns, plan.done_ns
+        self._since_ns = plan.since_ns
         margin = round((REST_S + self.settings.max_gap) * 1e9)
         self.track.release(min(plan.done_ns, self._complete_ns) - margin)
 
@@ -351,4 +353,5 @@ class Collector:
         self.notes['the clock jumped back'] += 1
         settings = self.settings
         self.track = Track(self._revolute.tolist(), settings.max_gap, settings.joint_buffer)
-        self._newest_ns = self._advanced_ns = self._settled_ns = self._sampled_ns = 0
+        self._newest_ns = self._advanced_ns = 0
+        self._settled_ns = self._sampled_ns = self._since_ns = 0

@@ -116,6 +116,7 @@ class Schedule:
 
     done_ns: int  # measurements before this are settled
     sampled_ns: int  # a stop at this moment has been sampled
+    since_ns: int  # begin of the stop that goes on
     ends: list[int] = field(default_factory=list)
     why: list[str] = field(default_factory=list)
     begins: list[int] = field(default_factory=list)
@@ -165,12 +166,14 @@ class Schedule:
             if settings.mode == 'triggered':
                 self.add(min(end, until), 'not requested')
                 continue
+            if begin == first:  # else the track may have forgotten its begin
+                self.since_ns = first
             while begin < end:
                 last = min(end, begin + longest)
                 if last > until or (goes_on and last == end):
                     return  # not over yet
-                calm = begin + (settle if begin == first else 1)  # the last part includes its end
-                if last - begin < shortest:
+                calm = max(self.since_ns + settle, begin + 1)  # the last part includes its end
+                if last - self.since_ns < shortest:
                     self.add(last, 'the stop was too short')
                 elif measured(calm, last):
                     self.add(last, '', calm)
@@ -179,6 +182,8 @@ class Schedule:
                 else:
                     self.add(last, '' if begin == first else MOVING, calm)
                 begin = last
+        if until > self.done_ns:
+            self.since_ns = until
         self.add(until, MOVING)
 
 

@@ -18,7 +18,7 @@ from arriving import (
     toured,
 )
 from hypothesis import given, settings, strategies as st
-from streams import START, stamps, sweep
+from streams import START, stamps, stops, sweep
 
 from calib_ros.sampling.buffers import TOO_MANY
 from calib_ros.sampling.slices import NO_ACCIDENT
@@ -104,6 +104,15 @@ def test_a_flush_in_the_middle_of_a_stop_samples_it_once():
     made, samples = toured(flushing)
     assert made.unused[REST] > 10
     np.testing.assert_allclose([each.joints for each in samples], STOPS, atol=1e-3)
+
+
+@pytest.mark.parametrize('time', [5.3, 5.8])
+def test_a_flush_before_the_arm_has_settled_does_not_let_it_count_as_settled(time):
+    motion = stops(STOPS[:2], 1.0, 4.0)
+    events = joint_events(motion, 9.5), pose_events(motion, 9.5)
+    flush = (time, lambda made: made.flush())
+    expected, found = (play(collector(settle=1.5), *events, each) for each in ([], [flush]))
+    assert [each.count for each in found] == [each.count for each in expected]
 
 
 @pytest.mark.parametrize('mode', ['dwell', 'continuous'])

@@ -112,6 +112,14 @@ def test_a_long_stop_is_sampled_where_it_is_measured(late):
     assert len(play(collector(longest_stop=2.0), joints, measured)) == 1
 
 
+def test_the_short_last_part_of_a_long_stop_is_no_short_stop():
+    motion = stops(STOPS[:2], 1.0, 4.1)
+    made = collector(longest_stop=2.0, shortest_stop=1.0)
+    measured = pose_events(motion, 12.0, begin=4.05)[:1]
+    assert len(play(made, joint_events(motion, 12.0), measured)) == 1
+    assert not made.unused
+
+
 def test_joints_are_those_of_the_time_of_the_measurements():
     """Noise of the encoders is averaged too, about half a turn as well."""
     rng = np.random.default_rng(3)

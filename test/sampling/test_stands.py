@@ -26,7 +26,7 @@ NEVER = [(2, MOVING, 0), (5, '', 2), (8, MOVING, 5)]  # a stop of two parts, non
 def test_a_stand_becomes_a_stop_of_the_longest_time_at_most(
     stand, until, newest, done, sampled, seen, expected
 ):
-    plan = Schedule(done * S, sampled * S)
+    plan = Schedule(done * S, sampled * S, 0)
     stands, settings = S * np.array([stand]), Settings(shortest_stop=1.0, longest_stop=3.0)
     plan.of_stands(
         stands, until * S, newest * S, settings, lambda begin, end: begin <= seen * S <= end
