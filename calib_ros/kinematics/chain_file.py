@@ -45,7 +45,7 @@ CHAIN_KEYS = (
     *('name', 'convention', 'joints', 'parallel', 'base', 'tool', 'frames', 'effects', 'gravity'),
     'calibration',
 )
-FRAME_NAME = re.compile(r'(base|tool)_[^.]+')
+FRAME_NAME = re.compile(r'(base|tool)_[^.]*')
 FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay', 'lens')
 JOINT_KEYS = ('name', 'type', *ROW_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
 TWO_TURNS = 4.0 * math.pi

@@ -175,7 +175,7 @@ WRONG = [
     ('xyz: [0, 0, 0]', 'fixed: 1', 'base.fixed must be true or false, not 1'),
     *(
         ('{tool_1: null}', f'{{{name}: null}}', f'base_... or tool_... without dots, not "{name}"')
-        for name in ('base', 'camera', 'tool_a.b', 'base_')
+        for name in ('base', 'camera', 'tool_a.b')
     ),
     ('name: joint_2', 'name: tool_1', 'must not be named "tool_1"'),
     ('name: some_ur', 'name: [', 'not valid YAML'),

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given, strategies as st
 
+from calib_ros.kinematics.chain_file import parse_frames
 from calib_ros.sampling.dataset import dataset_of
 from calib_ros.sampling.sample import Frames, Sample
 
@@ -50,9 +51,11 @@ def test_frames_are_shared_by_those_that_share_them_and_by_no_others(many):
         ends = (target, device) if eye else (device, target)
         for side, name, end in zip(('base', 'tool'), (base, tool), ends, strict=True):
             assert name.startswith(side)
-            assert '.' not in name
             assert owners.setdefault(name, (session, eye, end)) == (session, eye, end)
     assert len(owners) == len({(name[:4], *owner) for name, owner in owners.items()})
+    further = owners.keys() - {'base', 'tool'}
+    kept = parse_frames({'frames': dict.fromkeys(further)}, 'calibration.yaml')
+    assert {name for name, _ in kept['frames']} == further
 
 
 @given(labels.filter(bool))
