@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from calib_ros.annotated import Count, as_annotated
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import STILL
 from calib_ros.identification.calibration import Calibration
@@ -166,14 +167,15 @@ class Placements(Shown):
     centre: int
 
 
+@as_annotated
 def place(
     arm: Calibration,
     task: FloatArray,
     aim: Objective = 'mean',
     model: Model = 'corrected',
     region: FloatArray | None = None,
-    cells: int = 9,
-    turns: int = 1,
+    cells: Count = 9,
+    turns: Count = 1,
     refinements: int = 4,
     progress: Notify = quiet,
 ) -> Placements:

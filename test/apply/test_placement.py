@@ -9,7 +9,7 @@ from calib_ros import Calibration, Chain, Problem, identify
 from calib_ros.apply import simulation, workspace
 from calib_ros.apply.workspace import in_base, place, task_of
 from calib_ros.cli.workspace import _task
-from calib_ros.errors import InputError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain import Joint
 from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.se3 import exp_rotation, transform
@@ -51,6 +51,20 @@ def test_the_best_placement_beats_the_centre_on_the_true_arm(cell, arm, placed, 
     for which, there in ((found.best, best), (found.centre, centre)):
         expected = np.sqrt(found.errors[which] ** 2 - arm.residual**2)  # the arm has none
         assert there == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ('given', 'said'),
+    [
+        ({'aim': 'median'}, 'unknown aim "median"'),
+        ({'model': 'best'}, 'unknown model "best"'),
+        ({'cells': 0}, 'cells must be at least 1, not 0'),
+        ({'turns': 0}, 'turns must be at least 1, not 0'),
+    ],
+)
+def test_what_no_search_could_be_of_is_refused(arm, given, said):
+    with pytest.raises(ConfigError, match=said):
+        place(arm, TASK, **given)
 
 
 def test_the_joint_values_bring_the_arm_to_the_placed_task(arm):
@@ -126,9 +140,9 @@ def test_a_task_out_of_reach_is_refused(arm):
     far[0, 0, 3] = 10.0
     with pytest.raises(InputError, match='reaches all 6 poses of the task at none'):
         place(arm, far, cells=3)
-    for upper in ([0.2, 1.0, 1.0], [np.nan, 1.0, 1.0]):
-        with pytest.raises(InputError, match='give the lower corner first'):
-            place(arm, TASK, region=np.array([[0.3, -1.0, 0.0], upper]))
+    for x, said in ((0.2, 'give the lower corner first'), (np.nan, 'region must not hold NaN')):
+        with pytest.raises(InputError, match=said):
+            place(arm, TASK, region=np.array([[0.3, -1.0, 0.0], [x, 1.0, 1.0]]))
 
 
 def test_a_task_from_a_box_of_joint_values_is_reached_where_it_came_from(arm):
