@@ -46,13 +46,14 @@ from calib_ros.shown import Shown, as_frame
 INDICES: tuple[Criterion, ...] = ('o2', 'o3', 'o4', 'o5')
 
 
+@as_annotated
 def choose(
     design: Design,
     candidates: FloatArray,
-    count: int,
+    count: Count,
     criterion: Criterion = 'd',
     task: FloatArray | None = None,
-    apart: float = STILL,
+    apart: NotNegative = STILL,
     progress: Notify = quiet,
     start: Index | None = None,
     exchanged: bool = True,

@@ -119,6 +119,10 @@ def test_wrong_arguments_are_refused():
     q = some(design.chain, 20)
     with pytest.raises(ConfigError, match='needs the poses of a task'):
         choose(design, q, 5, 'task')
+    with pytest.raises(ConfigError, match='count must be at least 1, not 0'):
+        choose(design, q, 0)
+    with pytest.raises(ConfigError, match='unknown criterion "e"'):
+        choose(design, q, 5, 'e')
 
 
 def measured_problem(name, session):
