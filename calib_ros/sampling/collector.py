@@ -192,9 +192,12 @@ class Collector:
             return 'the arm is moving'
         if stands[-1, 0] <= self._sampled_ns:
             return 'the arm stands and its pose is measured: move on'
-        if stands[-1, 0] < self._settled_ns and self.settings.mode == 'dwell':
-            return 'the arm stands, and nothing has been measured yet'
-        return f'the arm stands for {1e-9 * (newest - int(stands[-1, 0])):.1f} s'
+        begin = int(stands[-1, 0])
+        if begin < self._settled_ns and self.settings.mode == 'dwell':
+            begin = self._since_ns
+            if not self._measured(self._settled_ns, newest):
+                return 'the arm stands, and nothing has been measured yet'
+        return f'the arm stands for {1e-9 * (newest - begin):.1f} s'
 
     def capture(self, place: str = '') -> tuple[int, str]:
         """Take one sample of each stream now; return their number, or why there is none.

@@ -112,6 +112,14 @@ def test_a_long_stop_is_sampled_where_it_is_measured(late):
     assert len(play(collector(longest_stop=2.0), joints, measured)) == 1
 
 
+def test_a_measurement_that_waits_for_the_end_of_its_part_is_told_of():
+    motion = stops(STOPS[:1], 1.0, 60.0)
+    made = collector(longest_stop=2.0)
+    measured = pose_events(motion, 9.0, begin=4.5)[:1]
+    assert play(made, joint_events(motion, 5.0), measured, finish=False) == []
+    assert made.state() == 'the arm stands for 5.0 s'
+
+
 def test_the_short_last_part_of_a_long_stop_is_no_short_stop():
     motion = stops(STOPS[:2], 1.0, 4.1)
     made = collector(longest_stop=2.0, shortest_stop=1.0)
