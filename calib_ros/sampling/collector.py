@@ -21,7 +21,15 @@ from calib_ros.sampling.buffers import Rows, Waiting
 from calib_ros.sampling.hints import Hint, apart, ended, restless, sparse
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.sampler import ROW_WIDTH, Found, Numbered, Sampler
-from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Series, Slice, StreamKey
+from calib_ros.sampling.slices import (
+    JOINTS,
+    NO_ACCIDENT,
+    POSES,
+    Series,
+    Slice,
+    Stamps,
+    StreamKey,
+)
 from calib_ros.sampling.stops import SAMPLED, Known, Rests, Schedule, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.settings import Settings
@@ -192,12 +200,13 @@ class Collector:
             return 'the arm is moving'
         if stands[-1, 0] <= self._sampled_ns:
             return 'the arm stands and its pose is measured: move on'
-        begin = int(stands[-1, 0])
-        if begin < self._settled_ns and self.settings.mode == 'dwell':
-            begin = self._since_ns
-            if not self._measured(self._settled_ns, newest):
-                return 'the arm stands, and nothing has been measured yet'
-        return f'the arm stands for {1e-9 * (newest - begin):.1f} s'
+        if (
+            self.settings.mode == 'dwell'
+            and stands[-1, 0] < self._settled_ns
+            and not self._measured(self._settled_ns, newest)
+        ):
+            return 'the arm stands, and nothing has been measured yet'
+        return f'the arm stands for {1e-9 * (newest - self._begin(stands)):.1f} s'
 
     def capture(self, place: str = '') -> tuple[int, str]:
         """Take one sample of each stream now; return their number, or why there is none.
@@ -214,12 +223,13 @@ class Collector:
         if not (self.waiting.count or place):
             return 0, 'no measurements since the last pose'
         shortest = round(self.settings.shortest_stop * 1e9)
-        if not len(stands) or stands[-1, 1] < newest or newest - stands[-1, 0] < shortest:
+        stopped = len(stands) and stands[-1, 1] >= newest
+        if not stopped or newest - self._begin(stands) < shortest:
             return 0, (
                 f'the arm has not been still for {self.settings.shortest_stop:g} s yet '
                 f'(no joint further than {self.settings.still:g} rad or m)'
             )
-        begin = int(stands[-1, 0])
+        begin = self._begin(stands)
         if place:
             stamps = self.track.samples()[0]
             stamps = stamps[stamps >= begin]
@@ -237,6 +247,11 @@ class Collector:
             self._sampled_ns = self._settled_ns = newest
         causes = ', '.join(dict.fromkeys(self.dropped - dropped))
         return count, '' if count else causes or 'no measurement within this stop'
+
+    def _begin(self, stands: Stamps) -> int:
+        """Return the begin of the last of the stands (K, 2), even if the track forgot it."""
+        known = int(stands[-1, 0])
+        return min(known, self._since_ns) if known < self._settled_ns else known
 
     @property
     def _late_ns(self) -> int:

@@ -160,14 +160,14 @@ class Schedule:
             if begin > until or end <= self.done_ns:
                 continue
             self.add(begin, MOVING)
+            if begin == first:  # else the track may have forgotten its begin
+                self.since_ns = first
             if begin <= self.sampled_ns:
                 self.add(min(end, until), SAMPLED)
                 continue
             if settings.mode == 'triggered':
                 self.add(min(end, until), 'not requested')
                 continue
-            if begin == first:  # else the track may have forgotten its begin
-                self.since_ns = first
             while begin < end:
                 last = min(end, begin + longest)
                 if last > until or (goes_on and last == end):

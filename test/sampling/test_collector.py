@@ -174,6 +174,19 @@ def test_a_sample_is_taken_when_it_is_asked_for():
     np.testing.assert_allclose([each.joints for each in samples], STOPS[[0, 0, 2, 2]], atol=1e-3)
 
 
+@pytest.mark.parametrize('way', ['settle', 'shortest_stop'])
+def test_a_long_stand_is_known_from_its_begin(way):
+    motion = stops(STOPS[:1], 1.0, 60.0)
+    made = collector(mode='triggered', **{way: 3.0})
+    play(made, joint_events(motion, 2.9), pose_events(motion, 2.9), finish=False)
+    assert made.capture()[0] == 0
+    made = collector(mode='triggered', **{way: 3.0})
+    play(made, joint_events(motion, 6.0), pose_events(motion, 6.0), finish=False)
+    assert made.state() == 'the arm stands for 6.0 s'
+    assert made.capture() == (1, '')
+    assert made.capture() == (0, 'no measurements since the last pose')
+
+
 def test_a_capture_that_gives_nothing_says_why():
     motion = tour()
     made = collector(mode='triggered')
