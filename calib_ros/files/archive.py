@@ -36,7 +36,7 @@ class Archive:
         self.folder = folder
         self.error = ''  # why poses are in memory only; empty if all are in the journal
         words = (re.sub(r'[^\w.-]', lambda m: quote(m[0], ''), x) for x in robot.split('/', 1))
-        self._robot = short_name('_'.join(words))  # no two robots alike
+        self._robot = short_name('+'.join(words))  # no two robots alike: + is escaped in words
         self._joints = joints
         self._configuration = configuration
         self._journal: Journal | None = None

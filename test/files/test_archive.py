@@ -56,7 +56,8 @@ def full_disk(limit):
 
 def test_robots_with_similar_and_with_long_names_have_files_of_their_own(tmp_path):
     names = ('12_3', '12/3', '12//3', '12 3', '12%2F3', '12%203', 'ö', 'é' * 150, 'é' * 150 + '1')
-    robots = ['arm', 'arm_on_linear_axis', 'arm_A7', 'an/arm', *(f'arm/{name}' for name in names)]
+    kinds = 'arm', 'arm_on_linear_axis', 'arm_A7', 'arm+A7', 'an/arm', 'arm_A7/1'
+    robots = [*kinds, *(f'arm/{name}' for name in ('A7', 'A7_1', *names))]
     for k, robot in enumerate(robots):
         archive = open_archive(tmp_path, robot)
         archive.add(sample(k))
@@ -69,7 +70,7 @@ def test_robots_with_similar_and_with_long_names_have_files_of_their_own(tmp_pat
         newest = open_archive(tmp_path, robot).newest_calibration()
         assert newest.read_text() == f'calibration: {k}'
     files = {path.name.rpartition('_')[0] for path in tmp_path.glob('*Z.csv')}
-    assert {'arm_12_3', 'arm_12%2F3', 'arm_ö'} < files
+    assert {'arm+12_3', 'arm+12%2F3', 'arm+ö'} < files
 
 
 def test_the_newest_journal_is_resumed_when_the_clock_was_set_back(tmp_path):

@@ -217,7 +217,7 @@ def test_several_robots_in_one_process(tmp_path, recording):
         lines = {'a/calibration_node: calibration', 'b/calibration_node: calibration'}
         cell.spin_until(lambda: {report.status[0].name for report in reports} == lines)
     journals = sorted(path.name.partition('_')[0] for path in tmp_path.glob('*Z.csv'))
-    assert journals == ['meca500', 'ur10e']
+    assert journals == ['meca500+b', 'ur10e+a']
 
 
 def test_recordings_of_all_topics_tell_what_the_node_published(tmp_path):

@@ -90,7 +90,7 @@ def test_an_accepted_answer_keeps_its_hint_whole_and_says_how_to_save(cell, tmp_
 @pytest.mark.parametrize('folder', ['data', 'of a cell with a long name ' * 9])
 def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path, folder):
     identifying = cell.node._identifying
-    cell.node._archive._path = tmp_path / folder / 'ur10e_SN-0042_20260102T030405000006Z.csv'
+    cell.node._archive._path = tmp_path / folder / 'ur10e+SN-0042_20260102T030405000006Z.csv'
     cell.node._archive._path.parent.mkdir()
     reasons, figures = 'no gain on held-out poses; ' * 20, '60 poses, RMS 1 -> 2 mm; ' * 20
     for rule in Rule:

@@ -119,7 +119,7 @@ def test_a_name_that_was_good_is_looked_at_again(cell, data, tmp_path):
 
 
 def test_robots_of_a_kind_in_namespaces_keep_their_files_apart(data):
-    name = 'ur10e_left_20260101T000000000000Z.yaml'
+    name = 'ur10e+left_20260101T000000000000Z.yaml'
     (data / 'good.yaml').rename(data / name)
     with Cell() as cell:
         for namespace in ('left', 'right'):
