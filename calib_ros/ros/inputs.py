@@ -31,6 +31,8 @@ from calib_ros.sampling.messages import CAMERA_INFO, PICTURES
 from calib_ros.sampling.slices import NO_ACCIDENT, SILENCE
 from calib_ros.settings import EXCEPTION
 
+RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+TRANSIENT_LOCAL, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
 QUEUE, IMAGE_QUEUE = 5 * BATCH // 2, BATCH // 100
 """Messages and images of a topic that may wait while the node is busy: for seconds, on a busy
 machine. From a deeper queue Fast DDS drops the newest messages beyond 5,000, and reports none."""
@@ -45,18 +47,12 @@ class Hearing:
     rate: float = 0.0
     last: float | None = None
     continuous: bool = False  # true once two came in quick succession, not one for each stop
-    deaf: str = ''  # the publisher's QoS that does not match the requested one
     latched: bool = False  # true if it is published only once
     lost: int = 0  # messages lost in transit, by DDS
     reported: int = 0  # the last total reported by DDS
     full: int = 0  # how often the queue was full
     lost_before: int = 0
     losing: bool = False  # true if either grew between the last two looks
-
-    def note_deaf(self, policy: QoSPolicyKind) -> None:
-        """Note that the publisher's QoS does not match."""
-        latched = policy == QoSPolicyKind.DURABILITY
-        self.deaf = 'not latched, but that' if latched else 'best effort, but reliable'
 
     def note_lost(self, total: int) -> None:
         """Count up to a total of lost messages; its change omits some.
@@ -155,9 +151,7 @@ class Inputs:
         self.failures = [f'no more messages on {topic}' for topic, each in topics if each.silent]
         gone = [(topic, 100.0 * each.gone) for topic, each in topics if each.gone]
         self.failures += [f'{share:.0f} % of {topic} is lost on the way' for topic, share in gone]
-        deaf = [(topic, each.deaf) for topic, each in topics if each.deaf and not each.count]
-        self.failures += [f'{topic} is published {how} is asked for' for topic, how in deaf]
-        self.failures += self._of_other_types()
+        self.failures += self._unheard()
         streams = [stream for stream, _ in self._inputs.values()]
         self.failures += [words for links in links_of(streams) for words in links.problems()]
 
@@ -189,9 +183,8 @@ class Inputs:
         hearing = self._topics.setdefault(name, Hearing())
         hearing.latched = stream.still
         events = SubscriptionEventCallbacks(
-            incompatible_qos=lambda event: hearing.note_deaf(event.last_policy_kind),
             message_lost=lambda event: hearing.note_lost(event.total_count),
-            use_default_callbacks=False,  # reported by `_of_other_types`
+            use_default_callbacks=False,  # reported by `_unheard`
         )
         try:
             subscription = self._node.create_subscription(
@@ -217,7 +210,7 @@ class Inputs:
         for stream in tuple(self._not_latched):
             topic = self._node.resolve_topic_name(stream.topic)
             infos = self._node.get_publishers_info_by_topic(topic)
-            if DurabilityPolicy.TRANSIENT_LOCAL in (i.qos_profile.durability for i in infos):
+            if TRANSIENT_LOCAL in (i.qos_profile.durability for i in infos):
                 self._not_latched.remove(stream)
                 subscription = self._node.create_subscription(
                     _message_type(stream.type),
@@ -229,13 +222,24 @@ class Inputs:
                 )
                 self._inputs[subscription] = stream, Hearing()  # the other one counts
 
-    def _of_other_types(self) -> list[str]:
+    def _unheard(self) -> list[str]:
+        """Return why publishers are not heard, by topic, even if others on it are."""
         found = set()
         for subscription, (stream, hearing) in self._inputs.items():
-            topic = subscription.topic_name
-            infos = [] if hearing.count else self._node.get_publishers_info_by_topic(topic)
-            for kind in {info.topic_type for info in infos} - {stream.type}:
-                found.add(f'{topic} is published as {kind}, not as {stream.type}')
+            topic, asked = subscription.topic_name, subscription.qos_profile
+            if hearing is not self._topics[topic]:  # the second one, for latched messages
+                continue
+            for info in self._node.get_publishers_info_by_topic(topic):
+                offered, how = info.qos_profile, ''
+                if info.topic_type != stream.type:
+                    how = f'as {info.topic_type}, not as {stream.type}'
+                elif (asked.reliability, offered.reliability) == (RELIABLE, BEST_EFFORT):
+                    setting = f'qos_overrides.{topic}.subscription.reliability'
+                    how = f'best effort, but reliable is asked for: set {setting} to best_effort'
+                elif (asked.durability, offered.durability) == (TRANSIENT_LOCAL, VOLATILE):
+                    how = 'not latched, but that is asked for: make it transient local'
+                if how:
+                    found.add(f'{topic} is published {how}')
         return sorted(found)
 
 
@@ -260,8 +264,8 @@ def _qos(stream: Stream, latched: bool = False) -> QoSProfile:
     latched = latched or stream.still
     return QoSProfile(
         depth=IMAGE_QUEUE if stream.type in PICTURES else QUEUE,
-        reliability=ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        reliability=RELIABLE if latched else BEST_EFFORT,
+        durability=TRANSIENT_LOCAL if latched else VOLATILE,
     )
 
 

@@ -26,13 +26,11 @@ def test_an_overridden_qos(tmp_path, recording):
     with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
         deaf = cell.peer.create_publisher(JointState, 'joint_states', BEST_EFFORT)
-        cell.spin_until(
-            lambda: (
-                heard
-                and '/joint_states is published best effort, but reliable is asked for'
-                in heard[-1].status[0].message
-            )
+        said = (
+            '/joint_states is published best effort, but reliable is asked for: '
+            'set qos_overrides./joint_states.subscription.reliability to best_effort'
         )
+        cell.spin_until(lambda: heard and said in heard[-1].status[0].message)
         assert heard[-1].status[0].level == DiagnosticStatus.WARN
         for topic, policy in (
             ('/joint_states', ReliabilityPolicy.RELIABLE),
@@ -44,7 +42,10 @@ def test_an_overridden_qos(tmp_path, recording):
         cell.play(topics(recording))
         assert cell.node.session.received['joints'] == len(recording.joints)
         cell.done('identify')
-        cell.spin_until(lambda: 'best effort' not in heard[-1].status[0].message)
+        del heard[:]
+        cell.spin_until(lambda: heard and said in heard[-1].status[0].message)  # another is heard
+        cell.peer.destroy_publisher(deaf)
+        cell.spin_until(lambda: said not in heard[-1].status[0].message)
 
 
 def test_a_topic_of_another_type_is_told(cell):
@@ -197,6 +198,6 @@ def test_what_dds_tells_of_losses_never_goes_below_zero():
 def test_no_executor_waits_for_the_inputs_or_their_events(cell):
     """Fast DDS wakes it for events as long as a message waits: a core would be busy."""
     (heard,) = (s for s in Node.subscriptions.fget(cell.node) if s.topic_name == '/joint_states')
-    assert len(heard.event_handlers) == 2
+    assert heard.event_handlers
     served = {*cell.node.subscriptions, *cell.node.waitables}
     assert served.isdisjoint([heard, *heard.event_handlers])
