@@ -13,6 +13,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 # matrices are small: a second BLAS thread costs more than it gives, especially on a busy cell
@@ -336,8 +337,8 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self.session.recording = bool(request.data)
         return True, 'recording' if request.data else 'not recording: messages are not used'
 
-    def _on_save(self, published: Published) -> Answer:
-        return True, f'saved to {", ".join(map(str, self._keeper.save(published)))}'
+    def _on_save(self, given: tuple[Published, Path | None]) -> Answer:
+        return True, f'saved to {", ".join(map(str, self._keeper.save(*given)))}'
 
     def _on_load(self, request: Any) -> Answer:
         self._identifying.last = f'loaded {self._keeper.load()}'

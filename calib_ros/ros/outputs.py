@@ -89,18 +89,17 @@ class Keeper:
             self._broadcast.publish(calibration.chain, calibration.world_frame)
         self._adopted(calibration)
 
-    def to_save(self) -> Published:
-        """Return the calibration to save."""
+    def to_save(self) -> tuple[Published, Path | None]:
+        """Return the calibration to save, and `target_filename` as it is now."""
         if not self._published.text:
             raise InputError('there is no accepted calibration to save: call ~/identify first')
-        return self._published
+        return self._published, self._named('target_filename')
 
-    def save(self, published: Published) -> list[Path]:
-        """Write a calibration to `target_filename` or a new file, and its report beside it.
+    def save(self, published: Published, target: Path | None) -> list[Path]:
+        """Write a calibration to a `target` or a new file, and its report beside it.
 
         Returns the paths. The calibration is saved even without the report.
         """
-        target = self._named('target_filename')
         path = self._archive.save(published.text, published.configuration, target)
         written = [path]
         try:

@@ -20,6 +20,7 @@ from calib_ros.files.history import History
 from calib_ros.identification.identification import identify
 from calib_ros.ros.arguments import NODE
 from calib_ros.ros.boundary import InOrder
+from calib_ros.ros.outputs import Keeper
 
 
 @pytest.fixture
@@ -226,6 +227,27 @@ def test_what_is_called_at_last_holds(cell, recording, held, call):
     cell.play(topics(recording))
     judged = cell.call('validate')
     assert f'{STOPS} poses measured since' in judged.message
+
+
+def test_a_calibration_is_saved_where_it_was_to_be_when_it_was_called(
+    cell, recording, monkeypatch
+):
+    release, save = threading.Event(), Keeper.save
+
+    def late(*given):
+        assert release.wait(PATIENCE)
+        return save(*given)
+
+    monkeypatch.setattr(Keeper, 'save', late)
+    cell.play(topics(recording))
+    cell.done('identify')
+    cell.set_parameters({'target_filename': 'first.yaml'})
+    saved = cell.start_call('save')
+    cell.spin_until(lambda: cell.node._working['~/save'].busy)
+    cell.set_parameters({'target_filename': 'second.yaml'})
+    release.set()
+    cell.spin_until(saved.done)
+    assert 'first.yaml' in saved.result().message
 
 
 @pytest.mark.parametrize(
