@@ -13,7 +13,6 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 # matrices are small: a second BLAS thread costs more than it gives, especially on a busy cell
@@ -48,7 +47,7 @@ from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, InOrder, r
 from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.identifying import Filer, Identifying
 from calib_ros.ros.inputs import Inputs, deserialised
-from calib_ros.ros.outputs import FILENAMES, Keeper, Published
+from calib_ros.ros.outputs import FILENAMES, Keeper
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown_names
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.batches import Stream, feed, source_streams
@@ -92,8 +91,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             chain, given.settings, self._on_sample, self._archive.remove
         )
         self.session.pictures.cameras = cameras_of(given.settings.sources)
-        filer = Filer(given.history, given.serial, chain)
-        self._filer, self._status_text = filer, ''
+        self._filer, self._status_text = Filer(given.history, given.serial, chain), ''
         self.lost = ''
         """Samples not kept in data_dir at the end, and why; empty if all were."""
         if given.resume:
@@ -111,7 +109,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._guide = Guide(self, self.session, self._boundary.guarded, candidates)
         self._keeper = Keeper(self, self.session, self._archive, given, urdf, self._guide.show)
         self._identifying = Identifying(
-            self, self.session, self._archive, filer, self._configuration, self._keeper.adopt
+            self, self.session, self._archive, self._filer, self._configuration, self._keeper.adopt
         )
         self._status = self.create_publisher(String, '~/status', LATCHED)
         self._diagnostics = Diagnostics(
@@ -139,7 +137,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         slow: tuple[tuple[str, Callable[[], Any], Callable[[Any], Answer]], ...] = (
             ('~/identify', lambda: identify.snapshot(self._inputs), identify.run),
             ('~/export', partial(self._settled, self._keeper.exportable), self._keeper.export),
-            ('~/save', partial(self._settled, self._keeper.to_save), self._on_save),
+            ('~/save', partial(self._settled, self._keeper.to_save), self._keeper.save),
             ('~/check', self.session.recent, self._on_check),
             ('~/validate', self._to_judge, self._on_validate),
         )
@@ -157,15 +155,17 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     def close(self) -> bool:
         """Stop; return False if an identification still runs and must not be waited for."""
-        ended = [each.join(JOIN_TIMEOUT) for each in self._working.values()]
-        ended.append(self._guide.join(JOIN_TIMEOUT))
+        running = [name for name, each in self._working.items() if not each.join(JOIN_TIMEOUT)]
+        for name in running:  # the caller hears no more
+            self.get_logger().warning(f'ended before the answer of {name}')
+        helped = self._guide.join(JOIN_TIMEOUT)
         self._take_messages()
         self.session.finish()
         self.lost = self._archive.close()
         if self.lost:
             self.get_logger().error(self.lost)
         self.destroy_node()
-        return all(ended)
+        return helped and not running
 
     # Parameters
 
@@ -336,9 +336,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     def _on_record(self, request: Any) -> Answer:
         self.session.recording = bool(request.data)
         return True, 'recording' if request.data else 'not recording: messages are not used'
-
-    def _on_save(self, given: tuple[Published, Path | None]) -> Answer:
-        return True, f'saved to {", ".join(map(str, self._keeper.save(*given)))}'
 
     def _on_load(self, request: Any) -> Answer:
         self._identifying.last = f'loaded {self._keeper.load()}'

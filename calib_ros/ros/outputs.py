@@ -95,11 +95,12 @@ class Keeper:
             raise InputError('there is no accepted calibration to save: call ~/identify first')
         return self._published, self._named('target_filename')
 
-    def save(self, published: Published, target: Path | None) -> list[Path]:
-        """Write a calibration to a `target` or a new file, and its report beside it.
+    def save(self, found: tuple[Published, Path | None]) -> tuple[bool, str]:
+        """Write a calibration to the target or a new file, and its report beside it.
 
-        Returns the paths. The calibration is saved even without the report.
+        Returns success, and where. The calibration is saved even without the report.
         """
+        published, target = found
         path = self._archive.save(published.text, published.configuration, target)
         written = [path]
         try:
@@ -110,7 +111,7 @@ class Keeper:
                 written.append(report)
         except Exception as err:  # the calibration is saved without the page
             self._node.get_logger().warning(f'the report of {path} is not written: {trouble(err)}')
-        return written
+        return True, f'saved to {", ".join(map(str, written))}'
 
     def at_start(self) -> tuple[Path | None, bool]:
         """Return the calibration file found at startup, and whether to load it."""

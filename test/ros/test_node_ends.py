@@ -139,6 +139,7 @@ def test_ended_while_an_identification_runs(journal):
         child.process.send_signal(signal.SIGINT)
         assert child.end() == 0, child.output
         assert 'Traceback' not in child.output
+        assert 'ended before the answer of ~/identify' in child.output
 
 
 def test_ended_while_it_waits_for_the_robot(tmp_path):
