@@ -26,16 +26,22 @@ _CALIBRATION, _JOURNAL, _SETTINGS = '.yaml', '.csv', '.settings.yaml'
 class Archive:
     """Files ROBOT_TIME of one robot in a folder, created if missing.
 
-    The robot is CHAIN or CHAIN/NAME, unique among its kind. `configuration` returns the text to
-    write beside a journal.
+    The robot is CHAIN or CHAIN/NAME, unique among its kind; `tip` is the last link of one of its
+    arms. `configuration` returns the text to write beside a journal.
     """
 
     def __init__(
-        self, folder: Path, robot: str, joints: int, configuration: Callable[[], str]
+        self,
+        folder: Path,
+        robot: str,
+        joints: int,
+        configuration: Callable[[], str],
+        tip: str = '',
     ) -> None:
         self.folder = folder
         self.error = ''  # why poses are in memory only; empty if all are in the journal
-        words = (re.sub(r'[^\w.-]', lambda m: quote(m[0], ''), x) for x in robot.split('/', 1))
+        names = filter(None, (*robot.split('/', 1), tip))
+        words = (re.sub(r'[^\w.-]', lambda m: quote(m[0], ''), name) for name in names)
         self._robot = short_name('+'.join(words))  # no two robots alike: + is escaped in words
         self._joints = joints
         self._configuration = configuration

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The robot's own description in, and the corrected one out."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
-from ros_cell import LATCHED, Cell, shift, topics, true_arm
+from ros_cell import LATCHED, STOPS, Cell, joint_messages, shift, topics, true_arm
 from std_msgs.msg import String
 
 from calib_ros.errors import ConfigError
@@ -71,3 +72,23 @@ def test_a_description_that_does_not_come_is_missed(tmp_path, monkeypatch):
             cell.start(['__ns:=/cell_2'], chain='robot_description', data_dir=str(tmp_path))
         said = 'waiting up to 0.2 s for /cell_2/robot_description'
         cell.spin_until(lambda: said in [each.msg for each in told])
+
+
+def test_the_two_arms_of_one_description_keep_their_files_apart(tmp_path, recording):
+    """The second one continued with the poses of the first."""
+    text = urdf_of(load_chain('ur10e')).removesuffix('</robot>').partition('>')[2]
+    arms = ''.join(
+        f'<joint name="{side}_mount" type="fixed"><parent link="world"/>'
+        f'<child link="{side}_base_link"/></joint>'
+        + re.sub('name="|link="', rf'\g<0>{side}_', text)
+        for side in ('left', 'right')
+    )
+    path = tmp_path / 'two_arms.urdf'
+    path.write_text(f'<robot name="two"><link name="world"/>{arms}</robot>')
+    given = {'chain': str(path), 'data_dir': str(tmp_path / 'data'), 'resume': True}
+    for side, expected in (('left', 0), ('right', 0), ('left', STOPS), ('right', 0)):
+        with Cell(**given, tip_link=f'{side}_flange_link') as cell:
+            assert len(cell.node.session.samples) == expected
+            if side == 'left' and not expected:
+                joints = joint_messages(recording, cell.node.session.joint_names)
+                cell.play(topics(recording, joint_states=joints))
