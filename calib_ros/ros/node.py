@@ -362,6 +362,8 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         words = self.session.status(str(self._identifying.progress), learn=False)
         trouble = textwrap.shorten(self._archive.trouble, STATUS_LENGTH // 2, placeholder=' ...; ')
         state, _, rest = words.partition('; ')
+        if self._inputs.failures:  # which may explain it
+            state = textwrap.shorten(state, STATUS_LENGTH // 2, placeholder=' ...')
         text = '; '.join((f'{trouble} {state}', *self._inputs.failures, rest))
         text = textwrap.shorten(text, STATUS_LENGTH, placeholder=' ...')
         if text != self._status_text:

@@ -66,6 +66,18 @@ def test_the_status_is_short_and_its_first_words_matter(monkeypatch, cell, recor
     assert '...; the arm is moving' in words[-1].data
 
 
+def test_why_a_topic_gives_nothing_is_in_the_status_beside_a_long_state(monkeypatch, cell):
+    """*set joint_names?* and the names left no room for a publisher that is not heard."""
+    said = '/joint_states is published best effort'
+    monkeypatch.setattr(cell.node._inputs, 'failures', [said])
+    monkeypatch.setattr(cell.node._inputs, 'look', lambda: None)
+    monkeypatch.setattr(
+        cell.node.session, 'status', lambda *_, **__: 'waiting ' * 20 + '; 0 poses'
+    )
+    status = cell.listen(String, 'calibration_node/status')
+    cell.spin_until(lambda: status and said in status[-1].data)
+
+
 def test_residuals_of_all_devices_are_drawn_in_one_frame(tmp_path, recording, truth):
     there = replace(truth, base=random_frame(np.random.default_rng(8), 2.0))
     poses, rng = recording.poses, np.random.default_rng(9)
