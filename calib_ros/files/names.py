@@ -33,10 +33,12 @@ DEVIATION = _set('d dev deviation delta dif diff difference abw abweichung')
 TURNED = _set('q quat quaternion orientation rot rotation')
 DISTANCE_WORDS = _set('distance length wire abstand')
 JOINT_WORDS = _set('q j a joint joints axis achse axe position pos theta th angle')
-NO_JOINT = _set('vel velocity acc acceleration force torque tau effort currents temp temperature')
-OTHER = NO_JOINT | _set(
-    'r s u v a f std stdev sd sigma err error rms var uncertainty twist angular angle euler'
+NO_JOINT = _set(
+    'vel velocity speed qd acc acceleration qdd force torque moment tau effort load currents '
+    'voltage power temp temperature std stdev sd sigma err error rms var uncertainty status mode '
+    'count counts'
 )
+OTHER = NO_JOINT | _set('r s u v a f twist angular angle euler')
 """Other quantities that have coordinates, too."""
 NO_PLACE = NOMINAL_WORDS | DEVIATION | TURNED | OTHER
 EULER = {
@@ -152,19 +154,27 @@ def only_numbers(header: Sequence[str]) -> bool:
     return bool(header) and all(re.fullmatch(r'-?[\d.]+(e[+-]?\d+)?', name) for name in header)
 
 
+def _no_joint(name: str) -> bool:
+    """Tell whether a column holds other values of joints; an `actual current` is in amperes."""
+    words = {*words_of(name)}
+    amperes = 'current' in words and bool(words & (MEASURED_WORDS | NOMINAL_WORDS))
+    return amperes or bool(words & NO_JOINT)
+
+
 def _rank(name: str) -> int:
     """Return -1 for a measured joint by its name, 1 for a nominal one, 2 and more for others."""
     words = {*words_of(name)}
-    other = not words & JOINT_WORDS or bool(words & NO_JOINT)
-    return bool(words & NOMINAL_WORDS) - bool(words & MEASURED_WORDS) + 3 * other
+    nominal = bool(words & NOMINAL_WORDS)
+    return nominal - bool(words & MEASURED_WORDS) + 3 * (not words & JOINT_WORDS)
 
 
 def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:
     """Return the names in a header that count the joints, with a star for the number from 1."""
     if only_numbers(header):
         return {'q*': '#*'}
+    names = [name for name in header if not _no_joint(name)]
     for name, first in product(
-        sorted(header, key=lambda each: (_rank(each), len(words_of(each)))), (1, 0)
+        sorted(names, key=lambda each: (_rank(each), len(words_of(each)))), (1, 0)
     ):
         for one in re.finditer(str(first), name):
             before, after = name[: one.start()], name[one.end() :]

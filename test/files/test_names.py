@@ -106,6 +106,10 @@ def test_deviations_tell_that_plain_coordinates_may_be_nominal(tmp_path):
         ('q{}_target', 'q{}_current'),
         ('velocity_{}', 'position_{}'),
         ('actual_qd_{}', 'actual_q_{}'),
+        ('q{}_act_current', 'J{}'),
+        ('actual_joint_voltage_{}', 'J{}'),
+        ('q{}_act_speed', 'J{}'),
+        ('q{}_meas_std', 'A{}'),
     ],
 )
 def test_other_values_are_not_taken_for_measured_joints(tmp_path, first, second):
@@ -113,6 +117,17 @@ def test_other_values_are_not_taken_for_measured_joints(tmp_path, first, second)
     given = [form.format(k) for form in (first, second) for k in (1, 2)]
     path.write_text(text_of(JOINTS + 0.01, JOINTS, PLACES, names=[*given, *NAMES[2:]]))
     assert_same(proposed(path), None)
+
+
+@pytest.mark.parametrize('form', ['joint{}_speed', 'J{}_torque', 'A{}_power', 'q{}_act_current'])
+def test_other_values_are_never_proposed_for_joints(tmp_path, form):
+    path = tmp_path / 'cell.csv'
+    given = [form.format(1), form.format(2), *NAMES[2:]]
+    path.write_text(text_of(JOINTS, JOINTS + 0.1, PLACES, names=[*NAMES[:2], *given]))
+    assert_same(loading.table(path, ARM, Settings()), None)
+    path.write_text(text_of(JOINTS, PLACES, names=given))
+    with pytest.raises(InputError, match=r'--columns "q\*=NAME\*"; .*: --joints FILE'):
+        loading.table(path, ARM, Settings())
 
 
 @pytest.mark.parametrize('form', ['quat_{}', 'Quat {}', 'q_{}', 'orientation.{}', 'rot_{}'])
