@@ -152,9 +152,11 @@ class _Table:
         self._columns = self._asked(asked, optional)
         if not alone:
             own |= {name: ours for ours, name in quaternions_in(self.names).items()}
-        self._columns |= self._named({name: own[name] for name in own if own[name] not in asked})
+        named = self._named({name: own[name] for name in own if own[name] not in asked})
+        self._columns |= named
         if joints and chain is not None:
             self._complete(chain)
+        self._refuse_nominal(named)
 
     def _asked(self, asked: Mapping[str, Expression], optional: set[str]) -> dict[str, Expression]:
         """Return the expressions whose columns are there; others must be optional."""
@@ -205,13 +207,12 @@ class _Table:
             kept = {ours: each for ours, each in kept.items() if ours not in SOCKETS[:2]}
         if guessed:
             self.notes.append(f'by their names, {", ".join(guessed.values())}')
-        self._refuse_nominal(kept)
         return kept
 
-    def _refuse_nominal(self, kept: Mapping[str, Expression]) -> None:
+    def _refuse_nominal(self, named: Mapping[str, Expression]) -> None:
         """Refuse columns taken by our names if they may be nominal ones."""
-        called = [self._sheet.called(kept[n].names[0]) for n in POSITION if n in kept]
-        joints = len({*kept} & {*joint_columns(MOST_NAMES)}) * ('q1' in kept)
+        called = [self._sheet.called(named[n].names[0]) for n in POSITION if n in named]
+        joints = len({*named} & {*joint_columns(MOST_NAMES)}) * ('q1' in named)
         if doubt := in_doubt(self.names, [name_and_unit(name)[0] for name in called], joints):
             raise InputError(f'{self.path}: {doubt}')
 

@@ -22,7 +22,8 @@ def _set(words: str) -> frozenset[str]:
 
 
 MEASURED_WORDS = _set(
-    'meas measured measurement act actual ist istwert fbk feedback tracker leica laser faro vicon'
+    'meas measured measurement act actual true truth ist istwert fbk feedback tracker leica laser '
+    'faro vicon'
 )
 NOMINAL_WORDS = _set(
     'nom nominal cmd command commanded target soll sollwert ref reference des desired goal '
@@ -38,7 +39,7 @@ NO_JOINT = _set(
     'voltage power temp temperature std stdev sd sigma err error rms var uncertainty status mode '
     'count counts'
 )
-OTHER = NO_JOINT | _set('r s u v a f twist angular angle euler')
+OTHER = NO_JOINT | _set('r s u v a f e n g normal twist angular angle euler rotvec omega gyro')
 """Other quantities that have coordinates, too."""
 NO_PLACE = NOMINAL_WORDS | DEVIATION | TURNED | OTHER
 EULER = {
@@ -107,9 +108,12 @@ def in_doubt(header: Sequence[str], plain: Sequence[str], joints: int = 0) -> st
         [names for words, names in known.items() if words & some]
         for some in (MEASURED_WORDS, NOMINAL_WORDS, DEVIATION)
     )
-    beside = next(iter(measured or ([] if nominal else apart)), plain)
+    told = MEASURED_WORDS | NOMINAL_WORDS | DEVIATION
+    others = [names for words, names in known.items() if words and not words & told]
+    beside = next(iter(measured or ([] if nominal else apart or others)), plain)
     if len(plain) == len(POSITION) and beside != [*plain]:
-        better = option(POSITION, beside) if measured else option(POSITION, plain, beside)
+        of_sum = beside in apart and beside not in measured
+        better = option(POSITION, plain, beside) if of_sum else option(POSITION, beside)
         return (
             f'{", ".join(plain)} may be nominal beside {", ".join(beside)}: give {better}, or '
             f'{option(POSITION, plain)} if they were measured'

@@ -55,6 +55,8 @@ def proposed(path, said='.*'):
         ('{}', '{}_meas'),
         ('{}', 'Actual {}'),
         ('{}', 'Tracker {}'),
+        ('{}', '{}_true'),
+        ('{}_corr', '{}_true'),
     ],
 )
 @pytest.mark.parametrize('joints', [['q1', 'q2'], ['J1', 'J2']])
@@ -90,6 +92,20 @@ def test_deviations_tell_that_plain_coordinates_may_be_nominal(tmp_path):
     for apart in ('s{}', '{}_std', '{}_vel'):  # other quantities
         path.write_text(text_of(*columns, names=[*NAMES, *(apart.format(a) for a in 'xyz')]))
         assert len(loading.table(path, ARM, Settings()).fitted[0]) == 3
+
+
+@pytest.mark.parametrize('form', ['{}_corr', '{}_t', '{}_flange', '{} (2)', 'Corrected {}'])
+@pytest.mark.parametrize('ours', [NAMES[2:], ['X', 'Y', 'Z']])
+def test_plain_coordinates_may_be_nominal_beside_any_others(tmp_path, form, ours):
+    """They were read, with a note that the others were not."""
+    path = tmp_path / 'cell.csv'
+    given = [*NAMES[:2], *ours, *names(form)]
+    path.write_text(text_of(JOINTS, NOMINAL, PLACES, names=given))
+    assert_same(proposed(path, 'if they were measured'), None)
+    for other in ('{}_nom', 'n{}', 'e{}'):  # others tell what the plain ones are, or are no places
+        given = [*NAMES[:2], *ours, *names(other)]
+        path.write_text(text_of(JOINTS, PLACES, NOMINAL, names=given))
+        assert_same(loading.table(path, ARM, Settings()), None)
 
 
 @pytest.mark.parametrize(
