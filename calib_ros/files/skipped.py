@@ -5,22 +5,42 @@
 from __future__ import annotations
 
 import re
-from itertools import count, takewhile
+from collections.abc import Callable, Sequence
+from itertools import count, product, takewhile
+from typing import TypeAlias
 
 import numpy as np
 
 from calib_ros.errors import LONGEST, InputError
 from calib_ros.files.columns import BETWEEN, Columns, lines_in_words
 from calib_ros.files.vocabulary import MEASURED_COLUMNS, POSITION
-from calib_ros.kinematics.se3 import Flags
+from calib_ros.kinematics.se3 import Flags, FloatArray
+from calib_ros.values import ROUNDED
 
 STATISTIC = re.compile(
-    r'(mean|average|avg|median|mittelwert|moyenne|max|maximum|min|minimum|range|spannweite|sum|total'
-    r'|summe|rms|st(andar)?d[. ]*dev(iation)?|std|sd|sigma|[ée]cart[- ]type|standardabweichung)'
-    r'[ :.]*',
+    r'((mean|average)( value)?|avg|median|mittelwert|moyenne|max|maximum|min|minimum|range'
+    r'|spannweite|sum|total|summe|count|anzahl|rms|st(andar)?d[. ]*(dev(iation)?|err(or)?)|std|sd'
+    r'|([1-6] ?)?sigma|var(iance)?|varianz|[ée]cart[- ]type|standardabweichung)[ :.]*',
     re.I,
 )
 """Names of rows below a table."""
+Statistic: TypeAlias = Callable[[FloatArray], FloatArray]  # (C,) of columns (N, C)
+MOMENTS: tuple[Statistic, ...] = (
+    lambda columns: columns.mean(axis=0),
+    lambda columns: columns.sum(axis=0),
+    lambda columns: columns.std(axis=0),
+    lambda columns: columns.std(axis=0, ddof=1),
+)
+"""Statistics that are the values of a pose by chance only."""
+STATISTICS: tuple[Statistic, ...] = (
+    *MOMENTS,
+    lambda columns: columns.min(axis=0),
+    lambda columns: columns.max(axis=0),
+    lambda columns: np.ptp(columns, axis=0),
+    lambda columns: np.median(columns, axis=0),
+    lambda columns: np.full(columns.shape[1], len(columns)),
+)
+"""Statistics that a table may have, a row each."""
 NO_TARGET = re.compile(r'\0\s*-?(?:0|9{4,})[.,]?0*\s*(?:\0|$)')
 """A coordinate as devices write it without a target: 0 or -9999, all three alike."""
 
@@ -39,7 +59,41 @@ def measured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
             raise InputError(f'{made.path}: {what} in {left}: rows need x, y, z or distance')
         notes.append(f'{made.path}: {what} in {left}: skipped')
         empty = empty | rows
-    return (made.select(~empty) if notes else made), tuple(notes)
+    kept = made.select(~empty) if notes else made
+    if (computed := _computed(kept)).any():
+        left = lines_in_words(kept.lines[computed].tolist())
+        notes.append(f'{made.path}: mean, sum or the like of all others in {left}: skipped')
+        kept = kept.select(~computed)
+    return kept, tuple(notes)
+
+
+def _computed(made: Columns) -> Flags:
+    """Return (N,) which few rows, first or last, are a mean, sum or the like of all others."""
+    measured = [name for name in (*POSITION, 'distance') if name in made.cells]
+    names = [*measured, *filter(re.compile('q[0-9]+').fullmatch, made.cells)]
+    every, none = np.arange(len(made.lines)), np.zeros(len(made.lines), dtype=bool)
+    first = made.numbers(measured[:1])  # of most tables enough
+    for few, last in product(range(1, 1 + len(STATISTICS)), (True, False)):
+        rows = every >= len(every) - few if last else every < few
+        if 2 * few < len(every) and _summarise(first, rows):
+            found = made.numbers(names)
+            varying = np.ptp(found[~rows], axis=0) > 0.0
+            if np.count_nonzero(varying) > len(POSITION) and _summarise(found[:, varying], rows):
+                return rows
+    return none
+
+
+def _summarise(columns: FloatArray, rows: Flags) -> bool:
+    """Tell whether rows (N,) of columns (N, C) are statistics of the others, one a moment."""
+    given, others = columns[rows], columns[~rows]
+    rounded = 0.1 * ROUNDED * others.std(axis=0)  # as means are written
+
+    def those_of(kinds: Sequence[Statistic]) -> Flags:
+        values = np.array([kind(others) for kind in kinds])
+        near = np.abs(given[:, None] - values) <= rounded
+        return np.asarray(near.all(axis=2).any(axis=1))
+
+    return bool(those_of(MOMENTS).any() and those_of(STATISTICS).all())
 
 
 def _lost(made: Columns) -> Flags:

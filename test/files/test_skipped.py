@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows that are no measurements: statistics, lost targets, remarks and headers again."""
 
+import numpy as np
 import pytest
-from test_foreign import PLAIN, assert_same
+from test_foreign import NAMES, PLAIN, assert_same, text_of
 
 from calib_ros import Chain, Settings, read_table
 from calib_ros.errors import InputError
@@ -28,6 +29,8 @@ def tables(path):
         ('Mean,0.1,0.2,0.3,0.4,0.5',),
         ('Mean:,0.1,0.2,0.3,0.4,0.5', 'Std. Dev.,1,1,1,1,1', 'max,1,1,1,1,1', 'RMS,1,1,1,1,1'),
         ('Mittelwert,,,0.3,0.4,0.5', 'Standardabweichung,,,1,1,1'),
+        ('Mean value,0.1,0.2,0.3,0.4,0.5', 'Std. error,1,1,1,1,1', '3 sigma,3,3,3,3,3'),
+        ('Variance,0.1,0.2,0.3,0.4,0.5', 'Count,3,3,3,3,3'),
     ],
 )
 def test_statistics_below_a_table_are_no_poses(tmp_path, rows):
@@ -36,6 +39,41 @@ def test_statistics_below_a_table_are_no_poses(tmp_path, rows):
     for table in tables(path):
         assert_same(table, None)
         assert any('statistics in line' in note for note in table.warnings)
+
+
+MANY = np.random.default_rng(7).normal(0.1, 0.8, (20, 5)).round(4)
+SUMMARIES = {
+    'mean': (np.mean,),
+    'mean and deviation': (np.mean, lambda rows, axis: rows.std(axis, ddof=1)),
+    'sum': (np.sum,),
+    'range': (np.min, np.max, np.mean),
+    'count': (lambda rows, axis: np.full(5, len(rows)), np.median, np.std),
+}
+
+
+@pytest.mark.parametrize('kinds', SUMMARIES)
+@pytest.mark.parametrize('above', [False, True])
+def test_rows_computed_of_all_others_are_no_poses(tmp_path, kinds, above):
+    """Without a name they were outliers, and told as what moved."""
+    path = tmp_path / 'cell.csv'
+    more = [kind(MANY, axis=0).round(4) for kind in SUMMARIES[kinds]]
+    path.write_text(text_of(np.vstack([*more, MANY] if above else [MANY, *more]), names=NAMES))
+    for table in tables(path):
+        np.testing.assert_allclose(table.fitted[0].positions, MANY[:, 2:], atol=1e-12)
+        assert any(f'of all others in line{"s" * (len(more) > 1)}' in w for w in table.warnings)
+
+
+def test_poses_that_are_hardly_computed_are_kept(tmp_path):
+    """A pose in the middle of the others has another measured place; repeats have one."""
+    path = tmp_path / 'cell.csv'
+    middle = np.array([*MANY[:, :2].mean(axis=0), *MANY[:, 2:].mean(axis=0) + 1e-3])
+    again = np.tile(MANY[:1], (8, 1))
+    again[::2, 2:] += 2e-5
+    again[-1, 2:] += 1e-5
+    for rows in (np.vstack([MANY, middle]), again, np.vstack([MANY, MANY])):
+        path.write_text(text_of(rows, names=NAMES))
+        for table in tables(path):
+            assert len(table.fitted[0]) == len(rows)
 
 
 def test_statistics_without_a_table_are_refused(tmp_path):
