@@ -16,7 +16,7 @@ BEGINNINGS = (
     *((mark, 'bag') for mark in (b'\x89MCAP', b'SQLite format 3', b'\x28\xb5\x2f\xfd')),
     *((mark, 'image') for mark in (b'\x89PNG', b'\xff\xd8\xff')),
     *((mark, 'report') for mark in (b'%PDF', b'<!doctype html')),
-    (b'&ACCESS', 'native'),
+    *((mark, 'native') for mark in (b'&ACCESS', b'DEFDAT')),
 )
 NATIVE = ('.src', '.mod', '.prg', '.ls', '.tp', '.script', '.urp', '.pgx', '.dtx', '.jbi')
 KIND_OF_SUFFIX = {
@@ -36,7 +36,7 @@ FILE_KINDS = {
     'program': ('a JointTrajectory', 'use compensate'),
     'native': (
         "a program in a robot's own language",
-        'to compensate it, write its joint values [rad, m] as a CSV with q1 ... qn',
+        'write its joint values [rad, m] as a CSV with q1 ... qn, a row for each pose',
     ),
     'chain': ('a YAML file', 'give an arm as --chain, a calibration as --calibration'),
     'urdf': ('a URDF', 'give it as --chain'),

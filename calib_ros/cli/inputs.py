@@ -43,6 +43,8 @@ def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | No
     given = {name: getattr(options, name) for name in LAYOUT_OPTIONS}
     if not (any(given.values()) or options.preset or options.columns or options.joints):
         return None
+    if options.joints:
+        refuse_others(options.joints, '--joints', 'table')
     given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])
     units = {name: given[name] for name in ('length', 'angle', 'joint_angle')}
     log = layout_of(options.joints_preset, options.columns, {} if options.joints_preset else units)

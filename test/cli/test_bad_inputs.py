@@ -72,12 +72,18 @@ def bad_inputs():
     yield (
         'a program of KUKA',
         (*bag_of, 'move.dat'),
-        "move.dat is a program in a robot's own language, but identify takes a table or a bag: to",
+        "move.dat is a program in a robot's own language, but identify takes a table or a bag: wr",
     )
+    yield (
+        'a program as joint values',
+        (*bag_of, 'good.csv', '--joints', 'start.dtx'),
+        "start.dtx is a program in a robot's own language, but --joints takes a table: write",
+    )
+    yield 'a program by its beginning', (*bag_of, 'good.csv', '--joints', 'part.dat'), 'but --jo'
     yield (
         'a program of KUKA to compensate',
         ('compensate', 'move.dat', '--chain', 'ur5e', '--calibration', 'none', '--out', 'o.csv'),
-        'but compensate takes a JointTrajectory or a YAML file or a table: to compensate it, wr',
+        'but compensate takes a JointTrajectory or a YAML file or a table: write its joint values',
     )
     yield 'no program', ('compare', 'start.dtx', 'none'), "start.dtx is a program in a robot's own"
     yield 'images as a table', (*bag_of, 'shots'), 'shots is a folder of images, but identify tak'
@@ -98,6 +104,7 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     (tmp_path / 'empty').write_text('')
     (tmp_path / 'broken.yaml').write_text('joints: [\n')
     (tmp_path / 'move.dat').write_text('&ACCESS RVP\nDEFDAT MOVE\nENDDAT\n')
+    (tmp_path / 'part.dat').write_text('DEFDAT MOVE\nDECL E6AXIS XP1={A1 1.0,A2 2.0}\nENDDAT\n')
     (tmp_path / 'start.dtx').write_text('<?xml version="1.0"?><Database/>')
     (tmp_path / 'shot.png').write_bytes(b'\x89PNG\xff')
     for folder, file in (('folder', ''), ('refused', 'result.json'), ('shots', '1.pgm')):
