@@ -41,7 +41,7 @@ MIXED_UP_UNITS = (
     ('radians', 'degrees', 'rad', np.degrees(1.0)),
 )
 """Actual unit of angles, assumed unit, option, and size of the actual in the assumed one."""
-SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
+SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254, 'ft': 0.3048}
 FIRST = ('measured', 'handed', 'order')
 """Parts whose mistakes are undone before those of single joints."""
 NOT_ON_FLANGE = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')

@@ -127,7 +127,8 @@ def named_by_option(
             found |= quaternions_in(header, sure=False)
         elif wire := distance_in(header):
             found = {n: each for n, each in found.items() if n not in POSITION} | wire
-    if (unit := words_of(found.get('x', ''))[1:]) in (['m'], ['in']):  # X_in is not read as a unit
+    # X_in is not read as a unit
+    if (unit := words_of(found.get('x', ''))[1:]) in (['m'], ['in'], ['ft']):
         more = f' --length {unit[0]}{more}'
     found = (like or ({'q*': 'NAME*'} if whole else dict.fromkeys(lacking, 'NAME'))) | found
     given = option(found, found.values())

@@ -10,17 +10,18 @@ import numpy as np
 
 from calib_ros.values import MOST_NAMES
 
-LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
+LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254, 'ft': 0.3048}
 """Metres in units of length."""
 ANGLES = {'rad': 1.0, 'deg': np.pi / 180.0}  # radians in units of angle
 LONG = {'degree': 'deg', 'radian': 'rad', 'meter': 'm', 'centimeter': 'cm', 'millimeter': 'mm'}
 LONG |= {'micrometer': 'um'}
 UNIT_SIGNS = {word + s: unit for word, unit in LONG.items() for s in ('', 's')}
 UNIT_SIGNS |= {'°': 'deg', 'µm': 'um', 'μm': 'um', 'inch': 'in', 'inches': 'in'}
+UNIT_SIGNS |= {'foot': 'ft', 'feet': 'ft'}
 UNIT_SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
 """Units by their signs and words in small letters."""
 _ANY = '|'.join(UNIT_SIGNS)
-_WORDS = '|'.join(sign for sign in UNIT_SIGNS if sign not in ('m', 'in'))
+_WORDS = '|'.join(sign for sign in UNIT_SIGNS if sign not in ('m', 'in', 'ft'))
 UNIT = re.compile(
     rf'(.*[^\s,/_]) *(?:[\[(](?![0-9]+[\])])([^\[\]()]+)[\])]|[,/] *({_ANY})|[_ ]({_WORDS}))', re.I
 )

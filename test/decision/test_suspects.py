@@ -131,6 +131,7 @@ DEGREE = 180.0 / np.pi
         (f'{ALL} metres, not in {DEGREES}', 0.0254, 0.0254, DEGREE),
         ('the positions are in mm, not metres', 1e3, 1.0, 1.0),
         ('the positions are in metres, not in', 0.0254, 1.0, 1.0),
+        ('the positions are in ft, not metres', 1.0 / 0.3048, 1.0, 1.0),
         ('the linear joints are in cm, not metres', 1.0, 1e2, 1.0),
         ('the linear joints are in metres, not mm', 1.0, 1e-3, 1.0),
         ('the joint values are in degrees, not radians', 1.0, 1.0, DEGREE),

@@ -226,6 +226,7 @@ def test_exports_of_others(run, tmp_path, preset):
         ('vicon', 'TX,TY,TZ\n,,,,,,mm,mm,mm\n', 'TX [m],TY [m],TZ [m]\n', 1.0),
         ('vicon', 'Objects\n', 'Units in meters\n', 1e-3),  # the header says mm
         ('spatialanalyzer', '// Spatial', '// Units: Inches\n// Spatial', 0.0254),
+        ('spatialanalyzer', '// Spatial', '// Units: Feet\n// Spatial', 0.3048),
         ('spatialanalyzer', '// Spatial', '// Length Units = m, Angle: deg\n// Spatial', 1.0),
         ('spatialanalyzer', '// Spatial', '// Units are in cm\n// Spatial', 1e-2),
         ('spatialanalyzer', '// Spatial', '// Robot unit in cell 4, power unit M 12\n//', 1e-3),

@@ -257,11 +257,12 @@ def test_numbered_columns_of_a_preset_are_of_its_own_form(tmp_path):
     assert layout.columns['qx'] == '#3'
 
 
-def test_a_unit_that_may_be_a_word_is_proposed(tmp_path):
+@pytest.mark.parametrize(('unit', 'size'), [('in', 0.0254), ('ft', 0.3048)])
+def test_a_unit_that_may_be_a_word_is_proposed(tmp_path, unit, size):
     """X_in was proposed as metres."""
     path = tmp_path / 'cell.csv'
-    path.write_text(text_of(JOINTS, PLACES / 0.0254, names=['q1', 'q2', *names('{}_in')]))
-    with pytest.raises(InputError, match='--columns "x=X_in,y=Y_in,z=Z_in" --length in'):
+    path.write_text(text_of(JOINTS, PLACES / size, names=['q1', 'q2', *names(f'{{}}_{unit}')]))
+    option = f'x=X_{unit},y=Y_{unit},z=Z_{unit}'
+    with pytest.raises(InputError, match=f'--columns "{option}" --length {unit}'):
         loading.table(path, ARM, Settings())
-    given = {'length': 'in'}
-    assert_same(read(path, preset='', columns=['x=X_in,y=Y_in,z=Z_in'], given=given), None)
+    assert_same(read(path, preset='', columns=[option], given={'length': unit}), None)
