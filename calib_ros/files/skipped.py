@@ -19,7 +19,7 @@ from calib_ros.values import ROUNDED
 
 STATISTIC = re.compile(
     r'((mean|average)( value)?|avg|median|mittelwert|moyenne|max|maximum|min|minimum|range'
-    r'|spannweite|sum|total|summe|count|anzahl|rms|st(andar)?d[. ]*(dev(iation)?|err(or)?)|std|sd'
+    r'|spannweite|sum|total|summe|count|anzahl|rms|st(andar)?d?[. ]*(dev(iation)?|err(or)?)|std|sd'
     r'|([1-6] ?)?sigma|var(iance)?|varianz|[ée]cart[- ]type|standardabweichung)[ :.]*',
     re.I,
 )
@@ -73,7 +73,8 @@ def _computed(made: Columns) -> Flags:
     names = [*measured, *filter(re.compile('q[0-9]+').fullmatch, made.cells)]
     every, none = np.arange(len(made.lines)), np.zeros(len(made.lines), dtype=bool)
     first = made.numbers(measured[:1])  # of most tables enough
-    for few, last in product(range(1, 1 + len(STATISTICS)), (True, False)):
+    # the most first: a deviation below a mean is also one of all rows with the mean
+    for few, last in product(range(len(STATISTICS), 0, -1), (True, False)):
         rows = every >= len(every) - few if last else every < few
         if 2 * few < len(every) and _summarise(first, rows):
             found = made.numbers(names)

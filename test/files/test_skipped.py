@@ -29,7 +29,12 @@ def tables(path):
         ('Mean,0.1,0.2,0.3,0.4,0.5',),
         ('Mean:,0.1,0.2,0.3,0.4,0.5', 'Std. Dev.,1,1,1,1,1', 'max,1,1,1,1,1', 'RMS,1,1,1,1,1'),
         ('Mittelwert,,,0.3,0.4,0.5', 'Standardabweichung,,,1,1,1'),
-        ('Mean value,0.1,0.2,0.3,0.4,0.5', 'Std. error,1,1,1,1,1', '3 sigma,3,3,3,3,3'),
+        (
+            'Mean value,0.1,0.2,0.3,0.4,0.5',
+            'Std. error,1,1,1,1,1',
+            'StDev,1,1,1,1,1',
+            '3 sigma,3,3,3,3,3',
+        ),
         ('Variance,0.1,0.2,0.3,0.4,0.5', 'Count,3,3,3,3,3'),
     ],
 )
@@ -45,6 +50,7 @@ MANY = np.random.default_rng(7).normal(0.1, 0.8, (20, 5)).round(4)
 SUMMARIES = {
     'mean': (np.mean,),
     'mean and deviation': (np.mean, lambda rows, axis: rows.std(axis, ddof=1)),
+    'mean and deviation of all': (np.mean, np.std),
     'sum': (np.sum,),
     'range': (np.min, np.max, np.mean),
     'count': (lambda rows, axis: np.full(5, len(rows)), np.median, np.std),
