@@ -129,7 +129,8 @@ def _constant(fitted: Fitted, wire: int) -> float:
     count, known, measured = len(names), rows[:, :-1], rows[:, -1]
     if len(rows) - count < TELLING:
         return 0.0
-    usual = np.eye(known.shape[1])[count:] / [[effects.expected(name)] for name in sags]
+    sizes = np.array([effects.expected(name) for name in sags])
+    usual = np.eye(known.shape[1])[count:] / sizes[:, np.newaxis]
     columns = np.column_stack([known[:, :count], moved[:, -1] - measured])
     tried = (known[:, :count], columns, np.concatenate([known, usual]))
     wanted = (measured, measured, np.append(measured, np.zeros(len(sags))))

@@ -172,14 +172,15 @@ def test_euler_angles_about_fixed_axes_in_the_order_of_their_columns_are_named()
     assert 'reverse the letters of --euler' in found.remedy
 
 
+@pytest.mark.parametrize('effects', [(), ('gravity',)])
 @pytest.mark.parametrize('zero', [0.0, 0.005, 0.1, -0.1])
-def test_the_zero_of_a_draw_wire_is_named(zero):
+def test_the_zero_of_a_draw_wire_is_named(zero, effects):
     """5 mm of it were accepted, and left the arm 0.8 mm off."""
     rng = np.random.default_rng(21)
     true = faulty(UR10E, Cell(), rng)
     seen = measure(true, UR10E.random_joints(80, rng), rng, 3e-5, oriented=False)
     lengths = np.linalg.norm(seen.positions, axis=1) + zero
-    result = identify(Problem(UR10E, replace(seen, distances=lengths)))
+    result = identify(Problem(UR10E, replace(seen, distances=lengths), effects=effects))
     way = 'long' if zero > 0.0 else 'short'
     found = re.search(rf'distances are (\S+) mm too {way}', ' '.join(map(str, result.refusals)))
     assert (found is not None) is bool(zero)
