@@ -7,9 +7,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import UR10E, measured_arm
+from fits import NOISE, SIGMAS, UR10E, arm, measured_arm, rms
 
-from calib_ros.apply.simulation import random_frame
+from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation import fitting
 from calib_ros.estimation.fitted import Simpler, _to_values, parameter_rows
@@ -20,6 +20,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.sizes import LEAST_SIZE
 from calib_ros.kinematics import se3
+from calib_ros.kinematics.effects import members
 
 
 def seen(count=12):
@@ -166,3 +167,14 @@ def test_noise_is_searched_as_far_as_the_sizes_of_errors():
     _, _, exact = measured_arm(0, 8, noise=(0.0, 0.0))
     _, _, found = fitting.fit(Problem(UR10E, exact, priors={'*_joint.*': 1e-2}))
     assert fitting._likely_noise(found) == LEAST_SIZE
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_effects_larger_than_usual_are_fitted_as_large_as_they_are(seed):
+    """The poses tell each of them, but priors of the usual size cost 0.4 mm."""
+    rng, names = np.random.default_rng(seed), members(UR10E, 'eccentricity')
+    sizes = 5e-3 * rng.normal(size=len(names))
+    true = arm(rng).with_effects(names).with_offsets(dict(zip(names, sizes, strict=True)))
+    seen = measure(true, UR10E.random_joints(40, rng), rng, *NOISE)
+    *_, found = fitting.fit(Problem(UR10E.with_effects(names), seen, **SIGMAS))
+    assert rms(found.chain, true, UR10E.random_joints(200, rng)) < 1.5e-4
