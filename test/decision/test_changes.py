@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fits import SCARA, UR10E
+from scipy import optimize
 
 from calib_ros.decision import changes
 from calib_ros.decision.changes import (
@@ -198,6 +199,27 @@ def test_the_zeros_of_all_joints_are_one_change(rng):
     given = [(SimpleNamespace(names=(names[0],)),)]
     ((found,),) = likelier(information, Effects(UR10E, names), 100.0, given)
     assert (found.owner, list(found.names)) == ('all joints', names)
+
+
+@pytest.mark.parametrize('odds', [0.96, 1.04])
+@pytest.mark.parametrize(('count', 'choices'), [(2, 5), (4, 7)])
+def test_one_change_more_must_be_likelier_than_any_of_as_many(count, choices, odds):
+    """All zeros count as one more than any three of them, a link with parts of the next once."""
+    names = [joint.driven for joint in UR10E.joints[1 : 1 + count]]
+    names += [Parameter('elbow_joint.a'), Parameter('elbow_joint.alpha')]
+    columns, matrix = Effects(UR10E, names), 1e10 * np.eye(count + 2)
+    change = np.array([*[3e-3] * (count - 1), 0.0, 0.0, 0.0])
+
+    def evidence(size):
+        change[count - 1] = size
+        information = Information(tuple(names), matrix, matrix @ change)
+        return columns.evidence(information, [names[count - 1]])[0]
+
+    optimize.brentq(lambda size: evidence(size) - odds * np.log(choices), 1e-7, 1e-3)
+    given = [(SimpleNamespace(names=(name,)),) for name in names[: count - 1]]
+    found = likelier(Information(tuple(names), matrix, matrix @ change), columns, 100.0, given)
+    told = [name for (each,) in found for name in each.names]
+    assert told == names[: count if odds > 1.0 else count - 1]
 
 
 def test_the_square_of_a_change_is_that_of_positions_in_the_best_frames():

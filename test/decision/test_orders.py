@@ -15,7 +15,7 @@ from calib_ros import identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision import mistakes, trials
 from calib_ros.decision.mistakes import explained, explained_alone
-from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
@@ -152,6 +152,15 @@ def test_rows_of_one_of_several_sets_are_told_with_its_device():
     problem = Problem(arm.with_frame('second', true.frame('second')), first, more=(second,))
     found = str(explained_alone(problem, true))
     assert found.startswith('in the measurements with second alone, in lines 1 to 3 alone')
+
+
+def test_lengths_of_a_wire_are_no_repeated_positions():
+    """It measures none: those of its table are zeros."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(2)
+    true, q = faulty(arm, Cell(), rng), arm.random_joints(20, rng)
+    zeros = Observations.from_arrays(q, np.zeros((20, 3)))
+    wire = replace(zeros, distances=np.linalg.norm(true.forward(q)[:, :3, 3], axis=1))
+    assert explained_alone(Problem(arm, wire), true) is None
 
 
 def test_mistakes_of_many_rows_are_searched_in_some_of_them(monkeypatch):

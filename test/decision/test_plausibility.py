@@ -248,6 +248,20 @@ def test_few_samples_show_no_errors_of_time(count, named):
     assert found == named
 
 
+@pytest.mark.parametrize('what', ['speed', 'acceleration'])
+def test_most_of_the_fastest_third_is_compared_with_most_of_the_slowest(what):
+    """Of the slowest and the fastest quarter or half the medians are others."""
+    rank = np.arange(300) / 300.0
+    rates = {'velocity': None, 'acceleration': None}
+    rates['velocity' if what == 'speed' else what] = np.outer(rank, np.ones(6))
+    small = (np.abs(rank - 0.245) < 0.09) | (np.abs(rank - 0.68) < 0.14)
+    noise = SimpleNamespace(position=1.1)
+    for calm, told in ((small, f'errors grow with the {what}'), (~small, '')):
+        result = SimpleNamespace(distances=[np.where(calm, 1.0, 9.0)], noise=noise)
+        found = _motion(SimpleNamespace(sets=[SimpleNamespace(**rates)]), result)
+        assert found.partition(' of the arm')[0] == told
+
+
 @pytest.mark.parametrize(('share', 'refused'), [(0.0, False), (1e-4, False), (1e-3, True)])
 @pytest.mark.parametrize('oriented', [True, False])
 def test_poses_that_lie_towards_the_stop_before_are_told_and_refused_where_it_harms(
