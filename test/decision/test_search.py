@@ -227,3 +227,12 @@ def test_signs_that_hide_each_other_are_tried_together(searched):
     assert _several(FAULTY, UR10E, given()) is None
     searched(options, alone | {'gh': 0.1}, pairs=['gh'])
     assert _several(FAULTY, UR10E, given()).suspects[0].remedy == 'g (undo g); h (undo h)'
+
+
+@pytest.mark.parametrize('pixels', [None, 1])
+def test_mistakes_at_once_of_images_are_those_of_boards_and_places(pixels, searched, monkeypatch):
+    searched([('a', 1, 'measured'), ('b', 1, 'j1')], {'ab': 0.1})
+    both = mistakes.suspects()
+    monkeypatch.setattr(mistakes, 'suspects', lambda chain, sets, boards: both if boards else [])
+    images = SimpleNamespace(**vars(FAULTY) | {'sets': [SimpleNamespace(pixels=pixels)]})
+    assert (_several(images, UR10E, given()) is None) == (pixels is None)

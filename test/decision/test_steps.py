@@ -107,6 +107,15 @@ def test_a_step_is_named_and_refused(design, what, size, unmodelled):
     assert (step.thing == 'the joint') == (what == 'joint')
 
 
+def test_a_step_of_simulated_measurements_without_noise_is_all_that_is_left():
+    rng = np.random.default_rng(0)
+    true = arm(rng)
+    seen = measure(true, UR10E.random_joints(COUNT, rng), rng, 0.0, 0.0)
+    step = identify(Problem(UR10E, moved(seen, true, 'tool', 1e-3), **SIGMAS)).step
+    assert (step.what, step.sample) == ('tool', AT)
+    assert step.share == pytest.approx(1.0)
+
+
 def test_a_bumped_target_is_no_gain_of_a_healthy_arm():
     """Along sweeps a bump of 0.3 mm passes for an error of the arm on poses left out."""
     named = 0

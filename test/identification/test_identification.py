@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,9 @@ from urdfs import UR10E_ORIGINS, ur10e
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError, UnknownNameError
 from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.robust import LOSSES
-from calib_ros.identification.identification import identify
+from calib_ros.identification.identification import _weak, identify
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.urdf import chain_from_urdf
@@ -264,3 +265,14 @@ def test_velocities_of_an_arm_that_stands_are_none():
     assert found.accepted
     assert found.names == plain.names
     np.testing.assert_allclose(found.chain.table, plain.chain.table, rtol=0, atol=1e-12)
+
+
+def test_parameters_of_which_priors_tell_more_than_poses_are_weak():
+    """Those given by the user are no news."""
+    problem = Problem(UR10E, measured_arm(0, 8)[2], priors={'wrist_2_joint.d': 1e-3})
+    sizes = {'elbow_joint.a': 0.7e-3, 'wrist_2_joint.d': 0.9e-3, 'elbow_joint.alpha': 0.72e-3}
+    rows = [SimpleNamespace(name=name, std=std) for name, std in sizes.items()]
+    rows.append(SimpleNamespace(name='elbow_joint.beta', std=None))
+    assert _weak(problem, rows) == ()
+    learned = Learned({row.name: 1e-3 for row in rows}, 1.0)
+    assert _weak(replace(problem, learned=learned), rows) == ('elbow_joint.alpha',)

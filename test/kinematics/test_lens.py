@@ -76,6 +76,9 @@ def test_a_lens_is_kept_in_chain_files():
     again = parse_chain(dump_chain(chain), 'file')
     assert again.frame('base').lens == lens
     assert again.frame('tool').lens is None
+    plain = dump_chain(load_chain('ur5e')) + 'tool: {lens: {fx: 1, fy: 2, cx: 3, cy: 4}}\n'
+    held = Lens(1.0, 2.0, 3.0, 4.0, fixed=True)
+    assert parse_chain(plain).frame('tool').lens == held == Lens(1.0, 2.0, 3.0, 4.0)
 
 
 @pytest.mark.parametrize(
