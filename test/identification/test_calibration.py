@@ -128,6 +128,8 @@ def test_the_nominal_chain_of_axes_that_coincide_has_no_b_unless_given():
         ('frames', {'base': 3}),
         ('nominal', {'base': {'xyz': [0.0]}}),
         ('nominal', {'effects': {'elbow_joint.sin_1': 'a'}}),
+        ('nominal', {'effects': 3}),
+        ('nominal', {'joints': 3}),
         ('rms_mm_after', [1] * 10_000),
         ('frames', [1] * 10_000),
         ('nominal', {'base': {'xyz': [0.0] * 10_000}}),

@@ -295,7 +295,9 @@ def test_what_moves_while_new_poses_are_measured_is_named(earlier):
     mixed = replace(first, positions=positions, oriented=np.zeros(16, dtype=bool))
     found = recalibrate(previous, Problem(UR10E, mixed, **SIGMAS), 0.1)
     assert not found.accepted
-    assert 'the zero of elbow_joint moved by 0.95 mrad before line 10' in found.refusal()[0]
+    why, what = found.refusal()
+    assert 'the zero of elbow_joint moved by 0.95 mrad before line 10' in why
+    assert what == 'measure again, or give only the poses from there on'
     held = replace(previous.chain.base, fixed=True)  # where the device does not stand any more
     there = replace(previous, chain=replace(previous.chain, base=held))
     step = there.step([replace(mixed, positions=positions + 0.1)])
