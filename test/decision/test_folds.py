@@ -129,7 +129,9 @@ def test_rounded_joint_values_are_no_gain(design):
     assert found >= 3
 
 
-@pytest.mark.parametrize('step', [5e-3, 1e-3, 5e-4, 1e-4, *np.deg2rad([0.2, 0.05, 0.01])])
+@pytest.mark.parametrize(
+    'step', [5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01])]
+)
 def test_what_rounding_gives_to_the_zero_of_a_joint(step, rng):
     """A value that most poses share hardly averages out."""
     q = UR10E.random_joints(40, rng)

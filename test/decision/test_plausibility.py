@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -276,6 +277,8 @@ def test_poses_that_lie_towards_the_stop_before_are_told_and_refused_where_it_ha
     assert result.accepted == (not refused)
     assert (Rule.LAG in [each.rule for each in result.refusals]) == refused
     assert any('towards the previous stop' in each for each in result.remarks) == (share == 1e-4)
+    told = [each for each in (*result.refusals, *result.remarks) if 'previous stop' in each]
+    assert all(re.search('explains (9[89]|100) % of the residuals', each) for each in told)
 
 
 @pytest.mark.parametrize('size', [3e-4, 1e-3])

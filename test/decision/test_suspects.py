@@ -14,7 +14,7 @@ from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.printed_board import size_of
 from calib_ros.decision.suspects import hidden, suspects
-from calib_ros.decision.undoing import Suspect
+from calib_ros.decision.undoing import Suspect, mirrored
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 
@@ -204,6 +204,16 @@ def test_ways_to_write_a_pose_are_undone_in_the_poses_as_measured(what, written,
         (undone,) = found.undone((spoilt,))
         for name in ('joints', 'positions', 'rotations'):
             np.testing.assert_allclose(getattr(undone, name), getattr(given, name), atol=1e-9)
+
+
+def test_a_mirror_turns_one_axis_round_and_nothing_else(rng):
+    arm = load_chain('ur10e')
+    seen = measure(arm, arm.random_joints(9, rng), rng)
+    signs = np.array([1.0, -1.0, 1.0])
+    found = mirrored(seen)
+    np.testing.assert_array_equal(found.positions, signs * seen.positions)
+    turns = se3.log_rotation(seen.rotations) * -signs  # about y alone as before
+    np.testing.assert_allclose(found.rotations, se3.exp_rotation(turns), atol=1e-9)
 
 
 @pytest.mark.parametrize('inverse', [False, True])
