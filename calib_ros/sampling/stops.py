@@ -4,16 +4,18 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from calib_ros.estimation.configurations import SCATTER
 from calib_ros.estimation.levels import FEW, MOST_OUTLIERS, TELLING
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.buffers import Rows
 from calib_ros.sampling.interpolation import unwrapped
-from calib_ros.sampling.slices import Stamps
+from calib_ros.sampling.slices import NO_ACCIDENT, Stamps
 from calib_ros.settings import EXCEPTION, Settings
 
 MOVING = 'the arm was moving'  # why a measurement is not used
@@ -218,6 +220,7 @@ class Rests:
     """Number of stops `sampled`, and joint noise at rests that no stop shows.
 
     They are missed if the joint values are noisier than `still`. At most `capacity` are counted.
+    Values that jump are at no rest, and go on doing so.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -225,18 +228,24 @@ class Rests:
         self._capacity = capacity
         self._unseen: list[float] = []
         self._resting = False
+        self._jumps = deque[float](maxlen=NO_ACCIDENT)  # noise larger than any at rest
 
     def note(self, noise: float | None) -> None:
         """Note the noise of joints at an undetected rest, None while they move."""
         before, self._resting = self._resting, noise is not None
+        if noise is None or SPIKE * noise <= SCATTER:
+            self._jumps.clear()
+        else:
+            self._jumps.append(noise)
         if noise is not None and not before and len(self._unseen) < self._capacity:
             self._unseen.append(noise)
 
     def needed(self, still: float) -> float | None:
         """Return the least `still` that detects most rests; None if it does already."""
-        if len(self._unseen) <= self.sampled:
+        jumping = len(self._jumps) == NO_ACCIDENT
+        if len(self._unseen) <= self.sampled and not jumping:
             return None
-        needed = SPIKE * float(np.median(self._unseen))
+        needed = SPIKE * float(np.median(self._jumps if jumping else self._unseen))
         return needed if needed > still else None
 
 

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from calib_ros.estimation.configurations import SCATTER
+from calib_ros.sampling.slices import NO_ACCIDENT
 from calib_ros.sampling.stops import SAMPLED, SPIKE, Known, Rests, Schedule, seen_stops
 from calib_ros.settings import Settings
 
@@ -70,6 +72,17 @@ def test_rests_unseen_count_once_each_up_to_a_capacity():
     rests.sampled = 2
     assert rests.needed(0.0) == SPIKE * 2.0
     rests.sampled = 3
+    assert rests.needed(0.0) is None
+
+
+def test_values_that_jump_for_long_are_no_rest():
+    rests = Rests(99)
+    rests.sampled = 9
+    for noise in [SCATTER] * NO_ACCIDENT:
+        assert rests.needed(0.0) is None
+        rests.note(noise)
+    assert rests.needed(0.0) == SPIKE * SCATTER
+    rests.note(None)
     assert rests.needed(0.0) is None
 
 
