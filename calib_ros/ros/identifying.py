@@ -211,6 +211,8 @@ class Identifying:
             kept = [each for each in (KEEP, NOT_FILED) if each in text]
             said = text.partition(kept[0])[0] if kept else text
             before, advice, _ = said.partition(self._advice or said)
+            if self._advice and not advice:  # it was cut off the error
+                before, advice = f'{said}; ', self._advice
             room = ANSWER_LENGTH - len(''.join((*kept, more)))
             if kept and not self._advice:
                 text = textwrap.shorten(said, room, placeholder=' ...')

@@ -18,6 +18,7 @@ from std_srvs.srv import SetBool
 
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.reasons import Rule
+from calib_ros.errors import TooFewObservationsError
 from calib_ros.files.history import History
 from calib_ros.identification.records import nominal_document
 from calib_ros.kinematics.chain_file import calibration_record, dump_chain, load_chain, parse_chain
@@ -25,7 +26,9 @@ from calib_ros.report.advice import rules
 from calib_ros.ros.identifying import KEEP, NOT_FILED, _without_middle
 from calib_ros.ros.inputs import deserialised
 from calib_ros.sampling.batches import Stream, feed
+from calib_ros.sampling.hints import apart
 from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.session import too_few
 from calib_ros.sampling.sources import STANDARD
 
 
@@ -102,6 +105,19 @@ def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path,
         said, _, name = found.partition(' ... full text: ')
         assert said.endswith(step)
         assert (tmp_path / folder / name).read_text() == f'{text}\n'
+
+
+def test_what_made_poses_too_few_is_in_the_answer_though_the_error_is_cut(cell, tmp_path):
+    """With clocks 3 s apart it was "measure 30 or more"."""
+    identifying, hint = cell.node._identifying, apart(-3.0).text
+    cell.node._archive._path = tmp_path / 'ur10e_20260102T030405000006Z.csv'
+    counts = f'2500 joint states{", dropped" * 30}; {hint}'
+    text = str(too_few(TooFewObservationsError(2, 5, '6 equations each'), counts))
+    assert hint not in text
+    identifying._advice = hint
+    first, advice, _ = identifying.shortened((False, text))[1].split(' ... ')
+    assert first.startswith('too few different poses: 2 measured')
+    assert hint.endswith(f': {advice}')
 
 
 def test_a_short_answer_names_the_mistake(cell, recording):
