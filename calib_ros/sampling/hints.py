@@ -83,14 +83,16 @@ def sparse(between: int, measurements: int, max_gap: float, shared: int) -> list
 
 def apart(ahead: float) -> Hint:
     """Report clocks too far apart: measurements are `ahead` of the joint states [s]."""
-    when, late = 'after', ''
+    when, late, instead = 'after', '', ''
     if ahead < 0.0:
         when, late = 'before', ' (if the device sends late, raise lateness)'
+        instead = ', or raise lateness'
     words = (
         f'measurements were stamped {abs(ahead):.1f} s {when} the newest joint state{late}: '
         'synchronise the clocks (NTP, PTP) and repeat the poses of that time'
     )
-    return Hint(f'stamps disagree by {abs(ahead):.1f} s: synchronise the clocks', words)
+    status = f'stamps disagree by {abs(ahead):.1f} s: synchronise the clocks{instead}'
+    return Hint(status, words)
 
 
 def ended(seconds: float) -> Hint:

@@ -197,16 +197,15 @@ def test_measurements_that_go_on_without_joint_states_are_told(seconds):
     ],
 )
 def test_a_clock_that_goes_far_astray_is_told_at_once(step, of, words):
-    """In the last 2 s of 40, however many measurements were matched before, and by how much.
-
-    And after it was set right, when nothing waits for joint states any more.
-    """
+    """In the last 2 s of 40, however many were matched before, and after it was set right."""
 
     def moved(times):
         return np.where((times > 18.0) & (times < 20.0), step, 0.0)
 
     clocks = {'late': moved} if of == 'measurements' else {'early': lambda t: -moved(t)}
-    warnings = told(heard(tour(25), 20.0, **clocks))
+    made = heard(tour(25), 20.0, **clocks)
+    warnings = told(made)
+    assert ('or raise lateness' in made.status()) == ('before' in words)  # the device sends late
     assert told(heard(tour(25), 40.0, **clocks)) == warnings
     assert len(warnings) == bool(words)
     said = f'measurements were stamped {words} the newest joint state'
