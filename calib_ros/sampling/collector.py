@@ -57,6 +57,7 @@ class Collector:
         self._advanced_ns = 0  # the same at the last round
         self._settled_ns = 0  # measurements before this are settled
         self._sampled_ns = 0  # a stop at this moment has been sampled
+        self._seated_ns = 0  # the ball was captured in a socket at this moment
         self._since_ns = 0  # begin of the stop that goes on
         self.rests = Rests(settings.pose_buffer)
         self.unmeasured = 0  # stops without a measurement since the last one with any
@@ -198,7 +199,7 @@ class Collector:
         stands = self.track.standing(self.settings.still, REST_S)
         if not len(stands) or stands[-1, 1] < newest:
             return 'the arm is moving'
-        if stands[-1, 0] <= self._sampled_ns:
+        if stands[-1, 0] <= max(self._sampled_ns, self._seated_ns):
             return 'the arm stands and its pose is measured: move on'
         if (
             self.settings.mode == 'dwell'
@@ -236,6 +237,7 @@ class Collector:
             joints = self.track.at(stamps, standing=True).joints
             approach = self.track.approach(stamps[:1], joints[:1])[0]
             self.sampler.in_socket(place, int(stamps[-1]), joints, approach)
+            self._seated_ns = newest
             return 1, ''
         self._round(begin)  # end earlier stops
         before, dropped = len(self.sampler.fresh), self.dropped.copy()
@@ -372,4 +374,4 @@ class Collector:
         settings = self.settings
         self.track = Track(self._revolute.tolist(), settings.max_gap, settings.joint_buffer)
         self._newest_ns = self._advanced_ns = 0
-        self._settled_ns = self._sampled_ns = self._since_ns = 0
+        self._settled_ns = self._sampled_ns = self._seated_ns = self._since_ns = 0

@@ -28,7 +28,9 @@ def captured(problem, count=4):
                 for k, t in enumerate(stamps.tolist())
             ]
             take(session, *come)
+            assert 'the arm stands for' in session.status()
             assert session.capture(f'place {number // 2}/{number % 2}') == (1, '')
+            assert 'its pose is measured: move on' in session.status()
             now += S
     return session
 
