@@ -25,6 +25,7 @@ Positive: TypeAlias = Annotated[float, lambda x: 0.0 < x < math.inf, 'a positive
 NotNegative: TypeAlias = Annotated[float, lambda x: 0.0 <= x < math.inf, 'a number of at least 0']
 Limit: TypeAlias = Annotated[float, lambda x: x >= 0.0, 'a number of at least 0']  # inf: none
 Share: TypeAlias = Annotated[float, lambda x: 0.0 < x < 1.0, 'between 0 and 1, as 0.95']
+Confidence: TypeAlias = Annotated[float, lambda x: 0.5 < x < 1.0, 'between 0.5 and 1']
 Fraction: TypeAlias = Annotated[float, lambda x: 0.0 <= x < 1.0, 'at least 0 and below 1']
 Count: TypeAlias = Annotated[int, lambda x: x >= 1, 'at least 1']
 Several: TypeAlias = Annotated[int, lambda x: x >= 2, 'at least 2']

@@ -28,7 +28,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from scipy.spatial import cKDTree
 
-from calib_ros.annotated import Positive, as_annotated
+from calib_ros.annotated import Confidence, Positive, as_annotated
 from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
@@ -157,7 +157,7 @@ def verify(
     arm: Calibration,
     sets: Sequence[Observations],
     tolerance: Positive | None,
-    confidence: float = CONFIDENT,
+    confidence: Confidence = CONFIDENT,
     new_base: bool = False,
     commanded: FloatArray | None = None,
     new_tool: bool = False,
@@ -180,14 +180,14 @@ def verify(
     Raises InputError for too few poses, distances, unknown frames, or poses far from all commands.
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
-    _check(arm, sets, confidence, fitted)
+    _check(arm, sets, fitted)
     group = configurations(np.concatenate([each.joints for each in sets]))
     comparison, left, uncorrected = _compared(arm, sets, commanded, fitted, group)
     progress(2 / 3)
     moments = moments_of(comparison.after.position, group) + SAME**2 * np.eye(3)  # without noise
     lost = IN_A_FRAME // 3 * new_base + new_tool  # the turn of a tool does not move the target
     rms, numbers, freedom, lower, upper = _interval(moments, lost, confidence, DECIDING)
-    mistake = _mistake(arm, sets) if rms > Settings.largest_error else None
+    mistake = _mistake(arm, sets, rms, 1e-3 * (comparison.figures[1].rms_mrad or 0.0))
     reused, limit = arm.reused(sets), tolerance or arm.limit(sets)
     verdict, needed = _decided(limit, lower, upper, numbers)
     if mistake or (reused and verdict != 'FAIL'):
@@ -245,7 +245,11 @@ def _compared(
     return replace(compare(before, after, sets), after=reached), left, uncorrected
 
 
-def _mistake(arm: Calibration, sets: Sequence[Observations]) -> mistakes.Explained | None:
+def _mistake(
+    arm: Calibration, sets: Sequence[Observations], error: float, angle: float
+) -> mistakes.Explained | None:
+    if error <= Settings.largest_error and angle <= Settings.largest_angle:
+        return None
     problem = Problem(arm.before, sets[0], more=sets[1:])
     return mistakes.explained(problem, far=True) or mistakes.explained_alone(problem, arm.chain)
 
@@ -308,14 +312,10 @@ def _decided(
     return ('PASS' if upper[0] <= tolerance else 'FAIL'), needed
 
 
-def _check(
-    arm: Calibration, sets: Sequence[Observations], confidence: float, fitted: tuple[str, ...]
-) -> None:
+def _check(arm: Calibration, sets: Sequence[Observations], fitted: tuple[str, ...]) -> None:
     chain = arm.chain
     if not sets:
         raise ConfigError('sets must hold at least one set of Observations')
-    if not 0.5 < confidence < 1.0:
-        raise ConfigError(f'confidence must be between 0.5 and 1, not {confidence}')
     for each in sets:
         chain.joint_values(each.joints)
         if each.distances is not None or each.socket:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from designs import design_of
 from scipy import stats
+from scipy.spatial.transform import Rotation
 from verified import NOISE, UR, in_words, measured, verification_page, with_errors
 
 from calib_ros.apply import simulation, verification
@@ -243,11 +244,19 @@ def test_repeats_do_not_count_as_more_configurations(arm):
 
 
 def test_orientations_that_are_far_off_are_told(arm):
-    seen = with_errors(arm, np.random.default_rng(0).normal(scale=1e-5, size=(6, 3)))
-    turned = replace(seen, rotations=np.swapaxes(seen.rotations, 1, 2))
-    right, wrong = (in_words(verify(arm, [each], 1e-4)) for each in (seen, turned))
-    assert 'only positions are judged' in wrong
-    assert 'only positions are judged' not in right
+    """Positions alone are judged; but a mistake in the table is none of the arm."""
+    seen = with_errors(arm, np.random.default_rng(0).normal(scale=1e-5, size=(8, 3)))
+    turned = replace(seen, rotations=seen.rotations @ np.diag([1.0, -1.0, -1.0]))  # the target
+    for each, told in ((seen, False), (turned, True)):
+        found = verify(arm, [each], None)
+        assert found.verdict == 'holds'
+        assert ('only positions are judged' in in_words(found)) is told
+    order = Rotation.from_matrix(seen.rotations).as_quat()[:, [1, 2, 3, 0]]
+    wxyz = replace(seen, rotations=Rotation.from_quat(order).as_matrix())
+    for tolerance in (None, 1e-4):
+        found = verify(arm, [wxyz], tolerance)
+        assert found.verdict == 'no verdict'
+        assert 'the quaternions are x y z w, not w x y z' in in_words(found)
 
 
 def test_a_device_that_stands_elsewhere(cell, arm):
