@@ -31,12 +31,11 @@ from calib_ros.shown import rounded
 from calib_ros.texts import dump_json
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')
-EARLIER_FILES = ('verification.txt',)  # of earlier versions: no verdict stays beside a newer one
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     screen.quiet = screen.quiet or options.json
-    with common.output_files(options, (*VERIFICATION_FILES, *EARLIER_FILES)) as contents:
+    with common.output_files(options, VERIFICATION_FILES) as contents:
         status, file = _verified(options, screen, contents)
     if options.out is not None:
         screen.say(common.written(options.out, contents))
