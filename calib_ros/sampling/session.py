@@ -11,7 +11,6 @@ from functools import partial
 import numpy as np
 
 from calib_ros.annotated import as_annotated
-from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.decision.result import Identification
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation.configurations import configurations
@@ -344,14 +343,6 @@ class CalibrationSession:
         refuse_other_joints(*theirs, 'the robot', self.chain, InputError)
         self._known = frozenset(self.samples if samples is None else samples)
         self.calibration = calibration
-
-    def validate(self) -> Comparison:
-        """Judge the calibration on the poses measured since, without fitting.
-
-        Returns the errors of the nominal chain in its frames, and of the calibration.
-        """
-        calibration, sets = self.since()
-        return compare(calibration.before, calibration.chain, sets)
 
     def recent(self) -> tuple[Calibration, Problem]:
         """Return the calibration, and the last stops since then as a problem."""

@@ -67,7 +67,7 @@ def call(session, name):
         elif name == 'pause':
             session.recording = not session.recording
         elif name == 'judge':
-            session.validate()
+            session.since()
         else:
             session.status()
     except InputError:

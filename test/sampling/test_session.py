@@ -9,6 +9,7 @@ from sessions import TRUE, UR5E, drive, samples, session, tracker
 from streams import POSE, TRACKER, pose, take
 
 from calib_ros.apply.simulation import random_frame
+from calib_ros.decision.comparison import compare
 from calib_ros.errors import InputError
 from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics.chain_file import load_chain
@@ -260,6 +261,12 @@ def test_the_world_is_the_frame_of_the_base():
 # Judging
 
 
+def judged(made):
+    """Return the errors of the nominal and the calibrated arm since, as ~/validate takes them."""
+    calibration, sets = made.since()
+    return compare(calibration.before, calibration.chain, sets)
+
+
 @pytest.mark.parametrize('first', [0, 1])
 def test_later_samples_are_judged_in_the_frames_of_their_targets(first):
     """Whichever target is seen first, or alone, and by a file that knows whose its frames are."""
@@ -272,13 +279,13 @@ def test_later_samples_are_judged_in_the_frames_of_their_targets(first):
     later.adopt(parse_calibration(made.calibration.dump(), 'c.yaml', UR5E))
     made.clear()
     drive(made, UR5E.random_joints(5, rng), sources[first : first + 1])
-    expected = made.validate().figures
+    expected = judged(made).figures
     later.restore(made.samples)
-    nominal, now = later.validate().figures
+    nominal, now = judged(later).figures
     assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
     assert (now.rms_mm, nominal.rms_mm) == pytest.approx([each.rms_mm for each in expected[::-1]])
     drive(made, UR5E.random_joints(5, rng), sources)
-    nominal, now = made.validate().figures
+    nominal, now = judged(made).figures
     assert now.count > 5
     assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
     assert made.calibration.chain is result.chain
@@ -291,7 +298,7 @@ def test_samples_that_were_fitted_are_known_again():
     made.adopt(parse_calibration(made.calibration.dump(), 'file'), ())
     calibration, sets = made.since()
     assert calibration.reused(sets) == 1.0
-    found, words = verdict(calibration, made.validate(), 1.0, sets)
+    found, words = verdict(calibration, judged(made), 1.0, sets)
     assert found == 'no verdict'
     assert 'the calibration was fitted to these measurements' in words
 
@@ -302,7 +309,7 @@ def test_what_was_there_before_does_not_judge():
     made.identify()
     made.remove_last()
     drive(made, 4, [tracker()])
-    _, now = made.validate().figures
+    _, now = judged(made).figures
     assert now.count == 4
     assert made.recent()[1].of_messages  # so that advice names topics, not columns
 
@@ -322,4 +329,4 @@ def test_samples_on_a_target_that_the_calibration_does_not_know_are_no_judges():
     made.identify()
     drive(made, 3, [(Source('x', target='new'), *tracker()[1:])])
     with pytest.raises(InputError, match='unknown to the cal'):
-        made.validate()
+        made.since()
