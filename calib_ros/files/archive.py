@@ -7,8 +7,9 @@ Rows that cannot be written, as on a full disk, wait in memory.
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
@@ -27,14 +28,15 @@ class Archive:
     """Files ROBOT_TIME of one robot in a folder, created if missing.
 
     The robot is CHAIN or CHAIN/NAME, unique among its kind; `tip` is the last link of one of its
-    arms. `configuration` returns the text to write beside a journal.
+    arms. `joints` are the names of q1, q2, ...; they and the text of `configuration` are written
+    beside a journal.
     """
 
     def __init__(
         self,
         folder: Path,
         robot: str,
-        joints: int,
+        joints: Sequence[str],
         configuration: Callable[[], str],
         tip: str = '',
     ) -> None:
@@ -43,7 +45,7 @@ class Archive:
         names = filter(None, (*robot.split('/', 1), tip))
         words = (re.sub(r'[^\w.-]', lambda m: quote(m[0], ''), name) for name in names)
         self._robot = short_name('+'.join(words))  # no two robots alike: + is escaped in words
-        self._joints = joints
+        self._joints, self._named = len(joints), f'joints: {json.dumps(joints)}'
         self._configuration = configuration
         self._journal: Journal | None = None
         self._waiting: list[tuple[Sample, bool]] = []
@@ -106,7 +108,8 @@ class Archive:
 
     def _begin(self, content: bytes = b'') -> None:
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(self._path.with_suffix(_SETTINGS), self._configuration(), overwrite=True)
+        beside = f'# {self._named}\n{self._configuration()}'
+        write_file(self._path.with_suffix(_SETTINGS), beside, overwrite=True)
         if content:
             write_file(self._path, content, overwrite=True)
         before, self._journal = self._journal, Journal(self._path, self._joints)
@@ -134,7 +137,14 @@ class Archive:
         newest = self.newest_journal()
         if newest is None:
             return (), (f'nothing to resume in {self.folder}: a new session begins',)
-        self._path = newest
+        self._path, beside = newest, newest.with_suffix(_SETTINGS)
+        text = beside.read_text('utf-8', 'replace') if beside.exists() else ''
+        named = text.partition('\n')[0].removeprefix('# ')
+        if named.startswith('joints: ') and named != self._named:
+            raise InputError(
+                f'{newest} has {named}; the chain has {self._named}: give them in that order, '
+                'or start without resume'
+            )
         try:
             samples, warnings = read_journal(self._path, self._joints)
         except InputError as err:

@@ -86,7 +86,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._boundary = Boundary(self.get_logger())
         folder = given_path(given.data_dir or f'{home}/calib_ros')
         robot = f'{chain.name}/{given.serial or self.get_namespace()[1:]}'.rstrip('/')
-        named = folder, robot, len(chain.joints)
+        named = folder, robot, chain.joint_names
         self._archive = Archive(*named, self._configuration, given.tip_link)
         self.session = CalibrationSession(
             chain, given.settings, self._on_sample, self._archive.remove

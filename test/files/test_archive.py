@@ -21,7 +21,7 @@ def sample(number, **more):
     return Sample(number, np.full(2, 0.1 * number), position=np.arange(3.0) + number, **more)
 
 
-def open_archive(folder, robot='arm', joints=2):
+def open_archive(folder, robot='arm', joints=('a', 'b')):
     return Archive(folder, robot, joints, lambda: 'settings: none\n')
 
 
@@ -144,9 +144,15 @@ def test_a_journal_from_which_all_was_taken_back_is_resumed(tmp_path):
 
 
 def test_the_journal_of_a_robot_with_other_joints_is_refused(tmp_path):
+    """In another order too: values would be those of other joints; without names it is resumed."""
     written(tmp_path, 1)
+    with pytest.raises(InputError, match=r'Z.csv has joints: \["a", "b"\]; .*: \["b", "a"\]'):
+        open_archive(tmp_path, joints=('b', 'a')).resume()
+    assert stamps(tmp_path) == [1]
+    next(tmp_path.glob('*.settings.yaml')).write_text('settings: none\n')
+    assert stamps(tmp_path) == [1]
     with pytest.raises(InputError, match='q3'):
-        open_archive(tmp_path, joints=3).resume()
+        open_archive(tmp_path, joints=('a', 'b', 'c')).resume()
 
 
 def test_a_full_disk_loses_nothing(tmp_path):

@@ -17,12 +17,13 @@ from std_msgs.msg import String
 
 from calib_ros.files.archive import Archive
 from calib_ros.files.journal import read_journal
+from calib_ros.kinematics.chain_file import load_chain
 
 
 @pytest.fixture
 def journal(tmp_path, recording):
     """Return a folder with the journal of a whole shift."""
-    archive = Archive(tmp_path, 'ur10e', 6, lambda: '')
+    archive = Archive(tmp_path, 'ur10e', load_chain('ur10e').joint_names, lambda: '')
     session = direct(recording)
     session.finish()
     for sample in session.samples:
