@@ -121,7 +121,7 @@ def test_results_are_read_only():
         (partial(PLAN, chosen=[1, 2, 100]), 'must be 3 numbers from 0 to 39, not .1, 2, 100'),
         (partial(PLAN, chosen=[1, 2, -1]), 'chosen must be 3 numbers from 0 to 39'),
         (partial(PLAN, chosen=[1, 2]), 'chosen must be 3 numbers from 0 to 39'),
-        (partial(calib_ros.verify, ARM, [SEEN], 0.0), 'tolerance must be a positive number'),
+        (partial(calib_ros.verify, ARM, [SEEN], 0.0), 'tolerance must be between 0 and'),
         (partial(calib_ros.read_table, 'a.csv', -1), 'joints must be at least 1, not -1'),
         (partial(calib_ros.read_table, 'a.csv', 6, sigmas=(1e-4, -1.0)), r'sigmas\[1\] must be'),
         (partial(RESULT.confidence_ellipsoid, np.zeros((1, 6)), 'a'), 'level must be of type'),

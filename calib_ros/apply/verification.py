@@ -28,7 +28,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from scipy.spatial import cKDTree
 
-from calib_ros.annotated import Confidence, Positive, as_annotated
+from calib_ros.annotated import Confidence, InMetres, as_annotated
 from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
@@ -156,7 +156,7 @@ class Verification(Shown):
 def verify(
     arm: Calibration,
     sets: Sequence[Observations],
-    tolerance: Positive | None,
+    tolerance: InMetres | None,
     confidence: Confidence = CONFIDENT,
     new_base: bool = False,
     commanded: FloatArray | None = None,

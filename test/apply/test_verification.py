@@ -114,7 +114,7 @@ def test_a_correction_that_did_not_arrive_shows(cell, arm, program):
 def test_pass_fail_and_undecided(cell, arm, program):
     true = cell[0]
     seen, shares = [measured(true, program)], []
-    rms = verify(arm, seen, 1.0, progress=shares.append).rms
+    rms = verify(arm, seen, 0.1, progress=shares.append).rms
     assert all(0.0 < share < 1.0 for share in shares)
     assert shares
     found = {scale: verify(arm, seen, scale * rms) for scale in (0.4, 1.0, 3.0)}
@@ -191,7 +191,7 @@ def test_the_repeatability_of_the_standard_needs_the_program(cell, arm, program)
     moved = np.repeat(compensate(Compensator(UR, arm.chain), program).joints, 10, axis=0)
     moved += rng.normal(scale=2e-4, size=moved.shape)
     seen = simulation.measure(cell[0], moved, rng, 1e-5, 1e-4)
-    found, alone = (verify(arm, [seen], 1.0, commanded=each) for each in (program, None))
+    found, alone = (verify(arm, [seen], 0.1, commanded=each) for each in (program, None))
     for k, (pose, other) in enumerate(zip(found.each, alone.each, strict=True)):
         places = seen.positions[found.group == k]
         apart = np.linalg.norm(places - places.mean(axis=0), axis=1)
@@ -348,7 +348,9 @@ def test_the_fitted_frame_costs_its_freedom(arm):
     """Errors that are noise alone: their size is found, though a frame was fitted to them."""
     rng = np.random.default_rng(3)
     squares = [
-        verify(arm, [with_errors(arm, rng.normal(scale=1e-4, size=(7, 3)))], 1, new_base=True).rms
+        verify(
+            arm, [with_errors(arm, rng.normal(scale=1e-4, size=(7, 3)))], 0.1, new_base=True
+        ).rms
         ** 2
         for _ in range(100)  # the figure is known by 2 %
     ]
@@ -359,7 +361,7 @@ def test_what_cannot_be_verified_is_refused(cell, arm):
     true = cell[0]
     joints = UR.random_joints(6, np.random.default_rng(0))
     seen = measured(true, joints)
-    for tolerance in (0.0, np.nan, np.inf):
+    for tolerance in (0.0, np.nan, np.inf, 0.3):  # the last one meant in mm
         with pytest.raises(ConfigError, match=f'tolerance must be .* not {tolerance}'):
             verify(arm, [seen], tolerance, 0.95)
     for confidence in (0.4, 1.0, 95.0):
