@@ -5,25 +5,33 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
-from itertools import count, product, takewhile
+from itertools import groupby, product
 from typing import TypeAlias
 
 import numpy as np
 
-from calib_ros.errors import LONGEST, InputError
+from calib_ros.errors import LONGEST, MOST_ENTRIES, InputError
 from calib_ros.files.columns import BETWEEN, Columns, lines_in_words
 from calib_ros.files.vocabulary import MEASURED_COLUMNS, POSITION
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.values import ROUNDED
 
-STATISTIC = re.compile(
-    r'((mean|average)( value)?|avg|median|mittelwert|moyenne|max|maximum|min|minimum|range'
-    r'|spannweite|sum|total|summe|count|anzahl|rms|st(andar)?d?[. ]*(dev(iation)?|err(or)?)|std|sd'
-    r'|([1-6] ?)?sigma|var(iance)?|varianz|[ée]cart[- ]type|standardabweichung)[ :.]*',
-    re.I,
+_MEAN = (
+    r'(\w+[ _-])?(mean|average|avg|mittel(wert)?|moyenne|m[eé]dia|promedio|平均[値值]?)'
+    r'( value| of [\w ]+)?'
 )
-"""Names of rows below a table."""
+_OTHERS = (
+    r'median|max|maximum|min|minimum|range|spannweite|sum|total|summe|gesamt|count|anzahl|rms'
+    r'|st(andar)?d?[. -]*(dev(iation)?|err(or)?|abw(eichung)?)|std|sd|([1-6] ?)?sigma'
+    r'|var(iance)?|varianz|[ée]cart[- ]type|standardabweichung|標準偏差|标准差|tolerance|toleranz'
+)
+MEAN, STATISTIC = (
+    re.compile(rf'(?:\A|{BETWEEN})\s*(?:{names})[ :.]*(?={BETWEEN}|\Z)', re.I)
+    for names in (_MEAN, f'{_MEAN}|{_OTHERS}')
+)
+"""Names of rows that hold no pose, and of those that may hold one."""
 Statistic: TypeAlias = Callable[[FloatArray], FloatArray]  # (C,) of columns (N, C)
 MOMENTS: tuple[Statistic, ...] = (
     lambda columns: columns.mean(axis=0),
@@ -113,16 +121,24 @@ def _lost(made: Columns) -> Flags:
 
 
 def without_statistics(columns: Columns) -> tuple[Columns, tuple[str, ...]]:
-    """Return the rows that are not called mean, max and the like at the end, and a note."""
-    named = set[int]()  # rows from the end
-    for given in columns.cells.values():
-        last = str(given)[-10 * LONGEST :].lower().split(BETWEEN)  # as read: text of many rows
-        for row, cell in enumerate(reversed(last), start=1):
-            if STATISTIC.fullmatch(cell.strip()) and last.count(cell) == 1:
-                named.add(row)
+    """Return the rows that are not called mean and the like, and a note.
+
+    Others, such as max, hold poses, except beside a mean or at the end; so do means if most rows
+    are called so.
+    """
     kept = np.ones(len(columns.lines), dtype=bool)
-    for row in takewhile(named.__contains__, count(1)):
-        kept[-row] = False
+    for text in map(str, columns.cells.values()):  # as read: text of many rows
+        if not STATISTIC.search(text[: 100 * MOST_ENTRIES] + BETWEEN + text[-10 * LONGEST :]):
+            continue
+        cells = text.lower().split(BETWEEN)
+        times, named = Counter(cells), [STATISTIC.match(cell) is not None for cell in cells]
+        means = {k for k, cell in enumerate(cells) if MEAN.match(cell)}
+        few = 2 * len(means) <= len(cells)
+        for called, run in groupby(range(len(cells)), named.__getitem__):
+            rows = [*run]
+            last = rows[-1] == len(cells) - 1 and all(times[cells[k]] == 1 for k in rows)
+            if called and (last or (few and means & {*rows})):
+                kept[rows] = False
     if kept.all():
         return columns, ()
     left = lines_in_words(columns.lines[~kept].tolist())

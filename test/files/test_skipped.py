@@ -36,6 +36,8 @@ def tables(path):
             '3 sigma,3,3,3,3,3',
         ),
         ('Variance,0.1,0.2,0.3,0.4,0.5', 'Count,3,3,3,3,3'),
+        ('平均値,0.1,0.2,0.3,0.4,0.5', '標準偏差,1,1,1,1,1'),
+        ('Mean of all points,0.1,0.2,0.3,0.4,0.5', 'Std.-Abw.,1,1,1,1,1'),
     ],
 )
 def test_statistics_below_a_table_are_no_poses(tmp_path, rows):
@@ -89,6 +91,27 @@ def test_statistics_without_a_table_are_refused(tmp_path):
     for foreign in (None, Foreign(Layout(), ARM)):
         with pytest.raises(InputError, match='no rows'):
             read_table(path, 2, foreign=foreign)
+
+
+@pytest.mark.parametrize('place', [1, 2, 3])
+def test_means_between_poses_are_no_poses(tmp_path, place):
+    """Of each group of measurements, and what stands beside them; they were read as poses."""
+    path = tmp_path / 'cell.csv'
+    lines = NAMED.splitlines()
+    lines.insert(place, 'Average:,0.1,0.2,0.3,0.4,0.5\nStd. Dev.,1,1,1,1,1')
+    lines.append('P2 Average,0.1,0.2,0.3,0.4,0.5\nmax,1,1,1,1,1')
+    for text in ('\n'.join(lines), '\n'.join(lines[:-1])):
+        path.write_text(text + '\n')
+        for table in tables(path):
+            assert_same(table, None)
+
+
+@pytest.mark.parametrize('names', [('mean',) * 3, ('std', 'alt', 'alt'), ('average speed', 'p')])
+def test_poses_with_such_names_are_kept(tmp_path, names):
+    path = tmp_path / 'cell.csv'
+    path.write_text(NAMED.replace('\np,', '\n{},').format(*names, *'pp'))
+    for table in tables(path):
+        assert_same(table, None)
 
 
 @pytest.mark.parametrize('count', [1, 3])
