@@ -57,7 +57,7 @@ tables of other systems (docs/tables.md); anything not given is guessed
   --joint-angle UNIT=  unit of joint values, if different
   --euler ZYX=  rx ry rz are Euler angles; zyx: fixed axes
   --quaternion wxyz=  order of the quaternion; default: xyzw
-  --separator NAME=  comma, semicolon, tab or space
+  --separator NAME=  comma, semicolon, tab, bar or space
   --decimal NAME=  point or comma
   --sheet NAME=  sheet of a workbook (.xlsx); default: the first with the columns
   --joints-preset NAME=  layout of the --joints log

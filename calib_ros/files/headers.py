@@ -87,7 +87,7 @@ def joints_left_out(path: Path, header: Sequence[str], joints: int) -> tuple[str
 
 def refuse_separator(path: Path, header: Sequence[str]) -> None:
     """Raise with advice if cells are not separated by commas."""
-    for name in ('semicolon', 'tab'):
+    for name in ('semicolon', 'tab', 'bar'):
         if any(SEPARATORS[name] in cell for cell in header):
             raise ColumnsError(
                 f'the cells of {path} are separated by {name}s: save it with commas between cells '

@@ -317,7 +317,7 @@ def _separator(path: Path, text: str) -> str:
     if not lines:
         raise InputError(f'{path} has no rows')
     best, most, cells = 'comma', 0, 1
-    for name in ('tab', 'semicolon', 'comma', 'space'):
+    for name in ('tab', 'semicolon', 'bar', 'comma', 'space'):
         mark = SEPARATORS[name]
         rows = [line.split() if mark == ' ' else line.split(mark) for line in lines]
         counts = [len(row) for row in rows]

@@ -23,16 +23,17 @@ UNIT_SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
 _ANY = '|'.join(UNIT_SIGNS)
 _WORDS = '|'.join(sign for sign in UNIT_SIGNS if sign not in ('m', 'in', 'ft'))
 UNIT = re.compile(
-    rf'(.*[^\s,/_]) *(?:[\[(](?![0-9]+[\])])([^\[\]()]+)[\])]|[,/] *({_ANY})|[_ ]({_WORDS}))', re.I
+    rf'(.*[^\s,/_]) *(?:[\[(](?![0-9]+[\])])([^\[\]()]+)[\])]|[,/] *({_ANY})|[-_ ]({_WORDS}))',
+    re.I,
 )
-"""A name with its unit: X [mm], X (mm), X / mm, X_mm; brackets may hold something else."""
+"""A name with its unit: X [mm], X (mm), X / mm, X_mm, X-mm; brackets may hold something else."""
 UNITS_ARE = re.compile(
     rf'\bunits?\b(?:\W*[:=\t]\W*({_ANY})|\W*(?:are )?(?:in )?({_WORDS}))\b(?:\W+({_ANY})\b)?', re.I
 )
 """Units in words: `Length Units = m`, `Units: mm, deg`, `units are in mm`."""
 SECONDS = ('', 's', 'sec', 'second', 'seconds')
 
-SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'space': ' '}
+SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'bar': '|', 'space': ' '}
 DECIMAL_COMMA = re.compile(r'\s*[+\u2212-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
 THOUSANDS = re.compile(r"[+\u2212-]?[1-9][0-9]{0,2}([\s.,'\u2019][0-9]{3})+([.,][0-9]*)?")
 MISSING = frozenset(('', 'nan', '-nan', 'na', 'n/a', '#n/a', '#nv', 'null', 'none', '-', '--'))

@@ -24,6 +24,11 @@ FORMS = {
     'a header of numpy': '# ' + PLAIN,
     'a header of numpy with blanks': '# two joints\n# ' + PLAIN.replace(',', ' '),
     'a header of SpatialAnalyzer': '//' + PLAIN,
+    'bars': PLAIN.replace(',', '|'),
+    'a table of Markdown': re.sub('(?m)^.+$', r'| \g<0> |', PLAIN.replace(',', ' | ')).replace(
+        'z |', 'z |\n|--|--|--|--|--|'
+    ),
+    'a unit behind a dash': PLAIN.replace('q1,q2,x', 'q1-rad,q2-rad,x'),
     'a date': 'Time;' + PLAIN.replace('\n', '\n2026-11-24 10:00:00;', 3).replace(',', ';'),
     'empty rows of a workbook': PLAIN + ',,,,\n' * 3,
     'a typographic minus': PLAIN.replace('-', '\u2212'),
