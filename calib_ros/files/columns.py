@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import MOST_ENTRIES, ColumnsError, InputError
 from calib_ros.files.headers import refuse_separator
-from calib_ros.files.vocabulary import DECIMAL_COMMA, IN_ORDER, MISSING, THOUSANDS
+from calib_ros.files.vocabulary import DECIMAL_COMMA, IN_ORDER, MISSING, THOUSANDS, UNIT_SIGNS
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.shown import some
@@ -81,6 +81,9 @@ class Columns:
         if commas := DECIMAL_COMMA.fullmatch(bare) is not None:
             told = f'; if these are thousands, {remedy}' * bool(THOUSANDS.fullmatch(bare))
             remedy = f'write a point or, of measurements, give --decimal comma{told}'
+        cut = re.fullmatch(r'[^a-z]*[0-9.] ?(\D+)', bare, re.I)
+        if cut and cut[1].lower() in UNIT_SIGNS:
+            remedy = f'write its unit into the header, {called.split(" [")[0]} [{cut[1]}]'
         words = bare.lower() not in MISSING and not re.search('[0-9]', bare)
         if words and row == 0:  # perhaps, as other tables have below their header
             remedy += '; units belong into the header: q1 [deg]'

@@ -136,6 +136,7 @@ FAULTS = [
     (f'q1,q2,x,y,z,frame_id\n{NAMED}', r'map \(lines 3, 4, 5, 6, 7, and 3 more\)'),
     *((POINTS.replace('5.5', f'"{each}"'), f"y must be a finite number, not '{each}': correct")
       for each in ('nan', 'inf', '-inf', '', ' ', 'twelve', '1;2')),
+    (POINTS.replace('5.5', '5.5 mm'), r'y must be .*: write its unit into the header, y \[mm\]'),
     (POINTS.replace('5.5', '"0,5"'), "line 3: y must be .*, not '0,5': write a point"),
     ('q1,q2,x,y,z,distance\n0,0,1,2,3,\n0,0,1,2,3,4\n', 'line 3 has both .* and distance: give'),
     ('q1,q2,location,socket\n0,0,A,1\n0,0,B,1_2\n', 'line 3: socket must be LOCATION/SOCKET'),
