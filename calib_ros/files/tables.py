@@ -88,12 +88,13 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
         raise ColumnsError(f'{path} has rotation matrices: calib_ros import makes quaternions')
     notes = [f'{path}: the column {name} is read as {ours}' for name, ours in meant.items()]
     notes += (*left, *skipped, *joints_left_out(path, found.header, joints))
-    if {*TURNS} <= {*cells} and QUATERNION[0] not in cells:
-        turns = ', '.join(TURNS)
-        notes.append(
-            f'{path}: {turns} are left out: give --euler or --rotation-vector to use them'
-        )
-    notes += turns_in(path, [name_and_unit(name)[0] for name in found.header])
+    if QUATERNION[0] not in cells:
+        if {*TURNS} <= {*cells}:
+            turns = ', '.join(TURNS)
+            notes.append(
+                f'{path}: {turns} are left out: give --euler or --rotation-vector to use them'
+            )
+        notes += turns_in(path, [name_and_unit(name)[0] for name in found.header])
     known = {*columns(joints), *TURNS, 'plane', f'q{joints + 1}'}
     return kept, (*notes, *not_read(path, [name for name in cells if name not in known]))
 

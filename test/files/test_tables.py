@@ -213,6 +213,10 @@ def test_sessions_come_in_the_order_asked_for(tmp_path):
         ('q1,q2,q3,x,y,z\n0,0,0,1,2,3\n', 'the column q3 is left out: the arm has 2 joints'),
         ('q1,q2,x,y,z,rx,ry,rz\n0,0,1,2,3,0,0,0\n', 'rx, ry, rz are left out: give --euler'),
         ('q1,q2,x,y,z,rx,qx,qy,qz,qw\n0,0,1,2,3,0,0,0,0,1\n', ''),
+        (
+            'q1,q2,x,y,z,qx,qy,qz,qw,roll,pitch,yaw\n0,0,1,2,3,0,0,0,1,0,0,0\n',
+            'columns not read: roll, pitch, yaw (',
+        ),
         ('q1,q2,x,y,z,q_w,,robot\n0,0,1,2,3,1,,left\n', 'columns not read: q_w, robot ('),
     ],
 )
