@@ -202,8 +202,9 @@ def _tests(fitted: Sequence[_Fitted], names: tuple[Parameter, ...]) -> _Tests:
     groups = _groups(names)
     owners = np.array([name.owner for name in names])
     freedom = np.array([row.freedom or KNOWN for row, _ in fitted])
-    sizes = [[r.tilt for r, _ in fitted[:k] if r.tilt is not None] for k in range(1, count + 1)]
-    size_of = np.array([np.median(each or 0.0) for each in sizes])
+    waves = np.array([row.tilt for row, _ in fitted if row.tilt is not None])
+    up_to = np.cumsum([row.tilt is not None for row, _ in fitted])
+    size_of = np.array([np.median(waves[:number]) if number else 0.0 for number in up_to])
     whole, pulled = np.cumsum(information, axis=0), np.cumsum(pulls, axis=0)
     years = np.array([(row.time - fitted[0][0].time) / YEAR for row, _ in fitted])
     drifts = np.diag(drift_of(names))
@@ -227,7 +228,8 @@ def _tests(fitted: Sequence[_Fitted], names: tuple[Parameter, ...]) -> _Tests:
         whole_of = np.einsum('kp,kp->k', moved, force)
         if lag == 1:
             scatter[nights] = whole_of / size
-        usual = np.array([_usual(scatter[1 : k + 1 - lag], size) for k in nights])
+            every = np.array([_usual(scatter[1 : k + 1], size) for k in range(count)])
+        usual = every[nights - lag]
         weight[number, nights] = inverse / usual[:, np.newaxis, np.newaxis]
         pull[number, nights] = force / usual[:, np.newaxis]
         several[number, nights] = 0.0
