@@ -27,6 +27,8 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     if not 0.0 < options.years < 1e9:
         raise InputError(f'--years must be positive, not {options.years:g}')
     common.at_least(options, workers=0)
+    if options.scheduler:
+        common.refuse(options, ('workers', 'memory'), 'does not apply to workers of a --scheduler')
     robots = read_plant(options.plant)
     history = History(options.history)
     cluster = Cluster(options.scheduler, options.workers, options.memory)

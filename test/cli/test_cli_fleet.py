@@ -257,6 +257,8 @@ def test_what_cannot_be_asked_for(folder, capsys):
     for more, words in (
         (['--years', '0'], '--years must be positive'),
         (['--workers', '-1'], '--workers must be'),
+        (['--scheduler', 'tcp://a:1', '--workers', '2'], '--workers does not apply'),
+        (['--scheduler', 'tcp://a:1', '--memory', '1GiB'], '--memory does not apply'),
         (['--history', 'nowhere://x'], 'a history cannot be at nowhere'),
         (['--history', 'plant.yaml'], 'a history must be a folder: plant.yaml is none'),
     ):
