@@ -135,6 +135,14 @@ def test_an_explanation_gains_what_a_fit_along_its_columns_does(rng):
     assert information.explained(np.zeros((3, 1)))[3] == 1  # of nothing
 
 
+def test_of_parameters_with_one_effect_the_first_is_named_and_only_then():
+    """Of any size and sign; 37 degrees away from it is another."""
+    columns = Effects(UR10E, THREE)
+    effects = ([1.0, 0.0, 0.0], [0.8, 0.6, 0.0], [-2.0, 0.0, 0.0])
+    columns._columns = dict(zip(THREE, map(np.array, effects), strict=True))
+    assert columns._distinct(THREE) == THREE[:2]
+
+
 def test_the_scale_of_the_device_is_that_of_all_lengths():
     names = [*THREE, Parameter('elbow_joint.a'), Parameter('wrist_1_joint.d')]
     found = Effects(UR10E, names, scaled=True)

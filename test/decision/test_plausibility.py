@@ -16,6 +16,7 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.leastsquares import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Joint
+from calib_ros.settings import Settings
 
 UR = load_chain('ur10e')
 NOT_OF_ONE_ARM = 'one arm does not fit all sessions'
@@ -279,6 +280,9 @@ def test_poses_that_lie_towards_the_stop_before_are_told_and_refused_where_it_ha
     assert any('towards the previous stop' in each for each in result.remarks) == (share == 1e-4)
     told = [each for each in (*result.refusals, *result.remarks) if 'previous stop' in each]
     assert all(re.search('explains (9[89]|100) % of the residuals', each) for each in told)
+    noise = Settings.sigma_position * result.noise.position
+    stated = Problem(UR, seen, sigma_position=noise / 0.9)  # nothing is left to explain
+    assert not any('previous stop' in each for each in identify(stated).remarks)
 
 
 @pytest.mark.parametrize('size', [3e-4, 1e-3])

@@ -77,11 +77,11 @@ def test_an_arm_that_fits_is_not_called_wrong_for_a_bad_correction(rng, before, 
 
 
 def rules_of(before, after, judged):
-    return set(refused(before, after, judged))
+    return {each.rule for each in refused(before, after, judged)}
 
 
 def refused(before, after, judged, **change):
-    """Return the rules that fail by position errors (N, 3) [m] on pairs that were left out."""
+    """Return the refusals by position errors (N, 3) [m] on pairs that were left out."""
     numbers, none = np.arange(len(judged)), np.full((len(judged), 3), np.nan)
     parts = [Residuals(x, none, numbers, none[:, :2]) for x in (before, after)]
     problem = SimpleNamespace(largest_error=0.01, largest_length=1.0, largest_angle=1.0, sets=())
@@ -94,7 +94,7 @@ def refused(before, after, judged, **change):
         validation=Comparison(*parts, judged),
         **given,
     )
-    return [each.rule for each in refusals(problem, result, None, False, True)]
+    return [*refusals(problem, result, None, False, True)]
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,9 @@ def refused(before, after, judged, **change):
 def test_parameters_of_a_fit_that_explains_nothing_are_told_last(rng, before, after, rules):
     away = rng.normal(size=(40, 3)) / np.sqrt(3.0)
     given = {'converged': False, 'parameters': [row('a', 1.5, 0.01)]}
-    assert refused(before * away, after * away, np.ones(40, dtype=bool), **given) == rules
+    found = refused(before * away, after * away, np.ones(40, dtype=bool), **given)
+    assert [each.rule for each in found] == rules
+    assert str(found[rules.index(Rule.COMMON_SENSE)]).endswith('kind: elbow_joint.a by 1500 mm')
 
 
 @pytest.mark.parametrize('size', [2e-3, 5e-3, 5e-2])

@@ -8,11 +8,11 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from fits import fitted
+from fits import NOISE, SIGMAS, fitted
 from in_sockets import DISTANCE, IIWA, cell, difference, led_to
 
 from calib_ros import Chain, Observations, Problem, identify
-from calib_ros.apply.simulation import Cell, faulty
+from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation.identifiability import structurally_independent
@@ -180,3 +180,13 @@ def test_a_socket_without_any_pair_is_named():
     nothing = problem.sets[3].select(np.zeros(0, dtype=int))
     with pytest.raises(InputError, match='base_1_1'):
         identify(replace(problem, more=(*problem.sets[1:3], nothing, *problem.sets[4:])))
+
+
+def test_a_tracker_beside_a_socket_is_not_weighed_as_out_of_scale():
+    """Where a set has no lengths another column took the place of the scale: +60 %."""
+    true, problem = cell(0)
+    rng = np.random.default_rng(0)
+    seen = measure(true, true.random_joints(40, rng), rng, *NOISE)
+    result = identify(Problem(IIWA, seen, more=problem.sets[:1], **SIGMAS))
+    assert result.accepted
+    assert (result.posterior.rival, result.posterior.scale) == (None, 0.0)
