@@ -67,11 +67,12 @@ def test_turns_count_where_those_of_the_target_are_known(names, free, lever, mon
         ('theta', 1e3, 100.0),
         ('alpha', 5.0, 10.0),
         ('alpha', 1e3, 10.0),  # no belt slips there
+        ('a', 5.0, 10.0),
     ],
 )
 def test_a_change_is_as_large_as_its_evidence_tells(kind, size, times):
-    """The evidence is that of one number, here known to a tenth of the typical change."""
-    name, known = Parameter('elbow', kind), 10.0 / changes.SIZES['rad']
+    """The evidence is that of one number, here known to a tenth of 1 mm or 2 mrad."""
+    name, known = Parameter('elbow', kind), 10.0 / (1e-3 if kind == 'a' else 2e-3)
     found = np.array([[known**2]]), np.array([10.0 * known * size])
     evidence, told = Effects(SCARA, [name]).evidence(Information((name,), *found), [name])
     assert told == times
