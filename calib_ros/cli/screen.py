@@ -9,6 +9,7 @@ are written: a topic or a joint may have any name.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sys
 import textwrap
@@ -80,9 +81,9 @@ class Screen:
         if self.quiet:
             self.reasons += [f'{text.removesuffix(":")} -> {step}' for step in steps[:1]]
             return
-        _print(text, '- ')
+        _print(_begun(text), '- ')
         for k, step in enumerate(steps):
-            _print(step, f'  {k + 1}. ' if len(steps) > 1 else '  -> ')
+            _print(_begun(step), f'  {k + 1}. ' if len(steps) > 1 else '  -> ')
 
     def warn(self, text: str, kind: str = 'warning') -> None:
         """Print a warning; to a file as one line."""
@@ -147,6 +148,11 @@ class Work(Progress):
                 bar.update(task, description=_printable(self.words))
                 if self.done.wait(FIRST_S / 5):
                     break
+
+
+def _begun(text: str) -> str:
+    """Return a text whose first word, but no name of the input, begins with a capital."""
+    return re.sub(r'\A[a-z](?=[a-z]*:? )', lambda letter: letter[0].upper(), text)
 
 
 def _print(text: str, head: str) -> None:

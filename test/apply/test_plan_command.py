@@ -84,7 +84,7 @@ def test_plan_names_a_rail_without_limits(run, tmp_path):
     rail = replace(rail, joints=(replace(rail.joints[0], upper=None), *rail.joints[1:]))
     (tmp_path / 'rail.yaml').write_text(dump_chain(rail))
     _, said, _ = run('plan', '--chain', 'rail.yaml', '--poses', 10, '--draw', 50)
-    assert said.endswith('- nothing was saved: --out FILE writes the poses and a report\n')
+    assert said.endswith('- Nothing was saved: --out FILE writes the poses and a report\n')
     assert 'linear_axis_joint has no limits: it is planned from 0 to 1 m; give' in said
 
 

@@ -65,7 +65,7 @@ def test_an_arm_without_correction_passes_only_with_a_remark(cell, folder, run):
     for more, wanted in (((), 0), (('--commanded', 'program.csv'), Status.NOT_ACCEPTED)):
         status, out, _ = run(*judge, *more)
         assert status == wanted
-        assert ('this judges the calibration' in ' '.join(out.split())) == (not more)
+        assert ('This judges the calibration' in ' '.join(out.split())) == (not more)
 
 
 def test_rows_marked_test_are_judged_like_others(cell, folder, run):

@@ -308,7 +308,7 @@ def test_one_gross_pose_leaves_no_doubt_about_the_arm(run, written, tmp_path):
     given = ('identify', 'new.csv', '--chain', 'ur5e', '--previous', written[0])
     status, out, _ = run(*given)
     assert status == Status.NOT_ACCEPTED
-    assert 'line 9 contradicts all others: without it they would be accepted' in out
-    assert 'perhaps changed' not in out
+    assert 'Line 9 contradicts all others: without it they would be accepted' in out
+    assert 'Perhaps changed' not in out
     write_csv(tmp_path / 'new.csv', rows[:7] + rows[8:])
     assert run(*given)[0] == 0

@@ -43,7 +43,7 @@ def test_the_command_writes_the_calibration_brought_up_to_date(earlier, run, tmp
     )
     status, said, _ = run(*given, 'out', '--out', 'again')
     assert status == 3
-    assert 'the calibration was fitted to these measurements' in ' '.join(said.split())
+    assert 'The calibration was fitted to these measurements' in ' '.join(said.split())
     assert not (tmp_path / 'again' / 'calibration.yaml').exists()
     status, _, told = run(*given, 'again')
     assert (status, 'again/result.json says why' in told) == (1, True)
