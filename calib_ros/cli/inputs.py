@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TypeAlias
@@ -99,8 +101,15 @@ def origin_of(
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
     told = ('operator', 'serial', 'device', 'conditions')
-    people = {name: getattr(options, name, '') for name in told}
+    people = {name: _as_utf8(getattr(options, name, '')) for name in told}
     return page.Origin(rows.inputs_of(*known), settings=settings, command=options.typed, **people)
+
+
+def _as_utf8(text: str) -> str:
+    """Return an argument that Python read in the locale (C, Latin-1) as the terminal wrote it."""
+    with suppress(UnicodeError):
+        return os.fsencode(text).decode()
+    return text
 
 
 def page_of(
