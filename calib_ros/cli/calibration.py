@@ -64,6 +64,7 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
         return common.Status.NOT_ACCEPTED
     write_file(options.out, source.text_with(corrected), overwrite=options.force)
     screen.say(f'wrote {options.out}: {in_words(compensator, result)}')
+    screen.say(f'by {arm.whose}')
     words, warning = arm.knowledge(result.joints, result.orientation_before)
     if words:
         screen.say(words)

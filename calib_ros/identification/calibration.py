@@ -166,6 +166,13 @@ class Calibration(Shown):
             )
         return serial or own
 
+    @property
+    def whose(self) -> str:
+        """Return the robot and the date of the calibration, as far as known."""
+        made, serial = (str(self.record.get(key) or '') for key in ('created', 'robot_serial'))
+        robot = f'{self.chain.name} {serial}' if serial else f'a {self.chain.name} (no serial)'
+        return f'the calibration of {robot}' + f', made {made[:10]}' * bool(made)
+
     def removed(self, joints: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the correction at joint values (N, n): distance (N,) [m] and angle (N,) [rad]."""
         before, after = self.before.forward(joints), self.chain.forward(joints)

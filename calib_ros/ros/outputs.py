@@ -119,8 +119,8 @@ class Keeper:
         path = named or self._archive.newest_calibration()
         return path, path is not None and (named is not None or self._given.autoload)
 
-    def load(self) -> Path:
-        """Load the calibration in `calibration_filename` or the newest one; return its path."""
+    def load(self) -> str:
+        """Load the calibration in `calibration_filename` or the newest one; return which."""
         path, _ = self.at_start()
         session = self._session
         if path is None:
@@ -130,7 +130,7 @@ class Keeper:
         calibration = parse_calibration(text, str(path), session.chain, session.settings)
         calibration.serial_of(str(path), self._given.serial)
         self.adopt(calibration, Published(text, ''))
-        return path
+        return f'{path}, {calibration.whose}'
 
     def exportable(self) -> tuple[Calibration, FloatArray | None]:
         """Return the calibration, and the joint values (N, n) of the samples."""

@@ -282,7 +282,8 @@ def test_the_calibration_of_another_robot_of_the_kind_is_not_loaded(tmp_path):
         with Cell(**parameters, serial=serial) as cell:
             answer = cell.call('load')
             assert answer.success == loads, answer.message
-            assert loads or 'the robot with serial "7"; this one is "8"' in answer.message
+            said = 'the calibration of ur10e 7' if loads else 'serial "7"; this one is "8"'
+            assert said in answer.message
             assert (cell.node.session.calibration is not None) == loads
 
 
