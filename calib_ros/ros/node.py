@@ -20,11 +20,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
-from rclpy.service import Service
-from rclpy.subscription import Subscription
-from rclpy.time_source import CLOCK_TOPIC
-from rclpy.waitable import Waitable
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -46,7 +41,7 @@ from calib_ros.ros.advisor import Guide
 from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, InOrder, run_node
 from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.identifying import Filer, Identifying
-from calib_ros.ros.inputs import Inputs, deserialised
+from calib_ros.ros.inputs import Batched, Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, Keeper
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown_names
 from calib_ros.ros.to_ros import LATCHED
@@ -65,7 +60,7 @@ JOIN_TIMEOUT = DIAGNOSTICS_PERIOD  # time [s] for which the shutdown waits for r
 STATUS_LENGTH = 120  # characters of the status: `ros2 topic echo` cuts texts at 128
 
 
-class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
+class CalibrationNode(Batched):
     """Calibrates one robot from its joint states and measurements."""
 
     def __init__(self, **node_options: Any) -> None:
@@ -206,37 +201,11 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return streams + source_streams(sources, types)
 
     @property
-    def subscriptions(self) -> Iterator[Subscription]:
-        """Return the subscriptions that an executor serves, without the inputs."""
-        inputs = getattr(self, '_inputs', ())  # rclpy asks during construction
-        return (each for each in super().subscriptions if each not in inputs)
-
-    @property
-    def waitables(self) -> Iterator[Waitable]:
-        """Return the waitables that an executor serves, without those of the inputs."""
-        inputs = getattr(self, '_inputs', ())
-        return (each for each in super().waitables if each not in inputs)
-
-    @property
-    def services(self) -> Iterator[Service]:
-        """Return the services that an executor serves, without those answered in order."""
-        calls = getattr(self, '_calls', ())
-        return (each for each in super().services if each not in calls)
-
-    def create_subscription(
-        self, msg_type: Any, topic: str, callback: Callable[..., None], *args: Any, **more: Any
-    ) -> Subscription:
-        """Subscribe, so that an invalid time does not end the node."""
-
-        def of_times(message: Any) -> None:
-            if message.clock.sec >= 0:
-                callback(message)
-                return
-            words = f'negative times on {CLOCK_TOPIC} are not used, {message.clock.sec} s say'
-            self.get_logger().warning(words, once=True)
-
-        taken = of_times if topic == CLOCK_TOPIC else callback
-        return super().create_subscription(msg_type, topic, taken, *args, **more)
+    def polled(self) -> Iterator[Any]:
+        """Return collections of what no executor serves; rclpy asks during construction."""
+        yield from super().polled
+        for name in ('_inputs', '_calls'):
+            yield getattr(self, name, ())
 
     def _take_messages(self) -> None:
         for problem in feed(self.session, self._inputs.take(), deserialised):
@@ -345,6 +314,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     # Topics out
 
     def _on_tick(self) -> None:
+        self._boundary.tried('the time', self.take_time)
         self._boundary.tried('taking messages', self._take_messages)
         self._boundary.tried('the corrected pose', self._keeper.publish_pose)
 

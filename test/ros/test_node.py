@@ -196,6 +196,8 @@ def test_stamps_follow_simulated_time(tmp_path):
         for seconds in (1000, 2000, 500):  # and when it jumps back
             clock.publish(Clock(clock=Time(sec=seconds)))
             cell.spin_until(lambda now=seconds: stamp_ns(diagnostics[-1]) == now * 10**9)
+        cell.set_parameters({'use_sim_time': False})
+        cell.spin_until(lambda: stamp_ns(diagnostics[-1]) > 10**18)
 
 
 def test_several_robots_in_one_process(tmp_path, recording):
