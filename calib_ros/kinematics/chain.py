@@ -128,8 +128,7 @@ class Chain(Shown):
         Two prismatic axes have no distance. Row i leads from axis i to the next in the standard
         convention, and to axis i in the modified one.
         """
-        first, last = (0, 1) if self.convention == 'standard' else (1, 0)
-        rows = self.joints[first : len(self.joints) - last]
+        rows = self.joints[self.convention == 'modified' :]
         return tuple(
             row.name
             for row, *axes in zip(rows, self.joints, self.joints[1:], strict=False)
