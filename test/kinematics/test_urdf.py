@@ -273,6 +273,7 @@ REFUSED = {
     'stuck': (elbow('revolute', '<limit lower="0" upper="0"/>'), 'are equal'),
     'limits': (edited(UR10E, f'lower="{-PI!r}"', 'lower="9"'), 'limits of joint "elbow'),
     'degrees': (edited(UR10E, 'rpy="1.570796327 ', 'rpy="90 '), 'lift_joint" must be in radians'),
+    'mass': (edited(SIDE_BRANCH, 'value="1.5"', 'value="a"'), 'inertial of link "side" must be a'),
     'unknown child': (edited(UR10E, '<link name="tool0"/>', ''), 'link at joint "flange'),
     'two joints': (edited(SCARA, '"lift"', '"wrist"'), 'two joints are named "wrist"'),
     'two links': (edited(SCARA, '<link name="hand"/>', '<link name="hand"/>' * 2), 'two links'),
