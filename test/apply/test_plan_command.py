@@ -38,6 +38,16 @@ def test_candidates_are_within_box_and_cone(rng):
     assert 0.0 < share < 0.1
 
 
+def test_unless_told_otherwise_a_target_is_seen_within_45_degrees_of_its_axis_z(rng):
+    chain = replace(arm(), base=simulation.random_frame(rng, 2.0))
+    tracker, q = np.array([3.0, 0.5, 1.0]), chain.random_joints(500, rng)
+    poses = invert(chain.base.matrix) @ chain.forward(q)
+    sight = tracker - poses[:, :3, 3]
+    cosines = (poses[:, :3, 2] * sight).sum(axis=1) / np.linalg.norm(sight, axis=1)
+    seen = Visibility(tracker=tracker).sees(design_of(chain), q)
+    np.testing.assert_array_equal(seen, np.degrees(np.arccos(cosines)) <= 45.0)
+
+
 def test_the_region_may_be_given_in_the_world(rng):
     chain = replace(arm(), base=simulation.random_frame(rng, 2.0))
     world = chain.base.matrix[:3, 3] + np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 0.0]])

@@ -28,3 +28,14 @@ def test_boards_stand_in_the_view_of_a_camera_as_far_away_as_said(rng):
     chain = before_camera(load_chain('ur10e'), camera, points, True, rng)
     pixels = photograph(chain, camera, points, True, 10, rng).pixels
     assert ((pixels > 0.0) & (pixels < (camera.width, camera.height))).all()
+
+
+def test_a_simulated_lens_bends_the_corners_of_its_pictures_a_little():
+    """By 1 to 5 % of their distance from the centre, as lenses of machine vision do."""
+    camera = Camera()
+    corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
+    seen = np.linalg.norm(corners - [camera.lens.cx, camera.lens.cy], axis=1)
+    straight = camera.lens.rays(corners) * [camera.lens.fx, camera.lens.fy]
+    bent = seen / np.linalg.norm(straight, axis=1) - 1.0
+    assert (bent > -0.05).all()
+    assert (bent < -0.01).all()
