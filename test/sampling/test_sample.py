@@ -3,11 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given, strategies as st
 
+from calib_ros.errors import InputError
 from calib_ros.kinematics.chain_file import parse_frames
+from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.dataset import dataset_of
-from calib_ros.sampling.sample import Frames, Sample
+from calib_ros.sampling.sample import Frames, Sample, View
 
 SIGMAS = (1e-4, 3e-4)
 PLAIN = Sample(1, np.zeros(2), position=np.ones(3), rotation=np.eye(3))
@@ -87,3 +90,32 @@ def test_what_only_some_samples_have_is_zero_or_blank():
     np.testing.assert_array_equal(both.velocity, [speed, 0.0 * speed])
     assert both.acceleration is None
     np.testing.assert_array_equal(both.approach, [speed, -speed])
+
+
+def test_images_become_corners_unless_the_poses_of_their_boards_are_asked_for():
+    """Of each corner: pixels, its point on the board, the image, the joint values; no pose."""
+    lens = Lens(900.0, 900.0, 500.0, 400.0)
+    images = [
+        View(np.arange(3.0 * count).reshape(-1, 3), np.full((count, 2), 10.0 * count), lens)
+        for count in (4, 5)
+    ]
+    samples = [
+        replace(PLAIN, stamp_ns=k, joints=np.full(2, k), view=each, eye_in_hand=True, device='eye')
+        for k, each in enumerate(images, 1)
+    ]
+    found = dataset_of(samples, SIGMAS)
+    (seen,) = found.fitted
+    assert (dict(found.lenses), seen.on_flange) == ({seen.camera: lens}, True)
+    which = np.repeat([1, 2], [4, 5])
+    np.testing.assert_array_equal(seen.stamps_ns, which)
+    np.testing.assert_array_equal(seen.joints, np.outer(which, [1.0, 1.0]))
+    np.testing.assert_array_equal(seen.pixels, np.concatenate([each.pixels for each in images]))
+    np.testing.assert_array_equal(seen.points, np.concatenate([each.points for each in images]))
+    np.testing.assert_array_equal(seen.positions, np.zeros((9, 3)))
+    np.testing.assert_array_equal(seen.rotations, np.tile(np.eye(3), (9, 1, 1)))
+    assert not seen.oriented.any()
+    (posed,) = dataset_of(samples, SIGMAS, posed=True).fitted
+    assert (posed.pixels, posed.oriented.tolist()) == (None, [True, True])
+    samples[1] = replace(samples[1], view=replace(images[1], lens=replace(lens, k1=0.1)))
+    with pytest.raises(InputError, match='CameraInfo of eye has changed'):
+        dataset_of(samples, SIGMAS)
