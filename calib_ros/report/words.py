@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from calib_ros.apply.confidence import interval_of
+from calib_ros.apply.confidence import interval_of, rms_limits
 from calib_ros.apply.verification import Verdict
 from calib_ros.decision.changes import FALSE, changes_in_words
 from calib_ros.decision.comparison import Comparison, ErrorFigures
@@ -165,7 +165,8 @@ def still_holds(
     previous: Calibration, found: Recalibration, sets: Sequence[Observations] = ()
 ) -> tuple[bool, str]:
     """Return whether a calibration holds at the last stops, those of sets, and why."""
-    text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} poses'
+    last = counted(found.before.count, 'pose')
+    text = f'RMS {found.before.rms_mm:.3f} mm at the last {last}'
     if found.changed:
         reasons = changes_in_words(found.changed)
         return False, (
@@ -216,9 +217,12 @@ def verdict(
 
 
 def _least_and_most(found: Comparison, when: int) -> tuple[float, float]:
-    """Return the 95 % interval [m] of the RMS error; a single pose shows at least its own."""
+    """Return the 95 % interval [m] of the RMS error; of a single pose by its coordinates."""
     least, most = interval_of(found, when)
-    return least if np.isfinite(most) else 1e-3 * found.figures[when].rms_mm, most
+    if np.isinf(most):
+        rms, coordinates = 1e-3 * found.figures[when].rms_mm, np.array([3.0])
+        least = float(rms_limits(rms, coordinates, CONFIDENT)[0][0])
+    return least, most
 
 
 NO_LONGER_HOLDS = (
