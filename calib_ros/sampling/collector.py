@@ -236,7 +236,8 @@ class Collector:
             stamps = stamps[stamps >= begin]
             joints = self.track.at(stamps, standing=True).joints
             approach = self.track.approach(stamps[:1], joints[:1])[0]
-            self.sampler.in_socket(place, int(stamps[-1]), joints, approach)
+            if not self.sampler.in_socket(place, int(stamps[-1]), joints, approach):
+                return 0, 'it was captured already, and no joint states came since'
             self._seated_ns = newest
             return 1, ''
         self._round(begin)  # end earlier stops

@@ -142,20 +142,28 @@ class Sampler:
 
     def in_socket(
         self, place: str, stamp_ns: int, joints: FloatArray, approach: FloatArray
-    ) -> None:
+    ) -> bool:
         """Make a sample of a ball in a socket, at joint values (N, n) while the arm stands.
 
-        Approached with the signs `approach` (n,).
+        Approached with the signs `approach` (n,). Returns False if one exists.
         """
-        sample = Sample(
-            stamp_ns=stamp_ns,
-            joints=joints[0] + unwrapped(joints - joints[0], self._revolute).mean(axis=0),
-            approach=approach,
-            device=place,
-            socket=True,
-        )
+        mean = joints[0] + unwrapped(joints - joints[0], self._revolute).mean(axis=0)
+        free = self._free(StreamKey(place, '', False, False, False), stamp_ns, mean)
+        if free is None:
+            return False
+        sample = Sample(stamp_ns=free, joints=mean, approach=approach, device=place, socket=True)
         self.remember([sample])
         self.fresh.append(sample)
+        return True
+
+    def _free(self, key: StreamKey, stamp_ns: int, joints: FloatArray) -> int | None:
+        """Return the stamp or the next free one; None if there is a sample at these joints."""
+        known = self._taken.setdefault(key, {})
+        while stamp_ns in known:
+            if np.abs(unwrapped(joints - known[stamp_ns], self._revolute)).max() <= STILL:
+                return None
+            stamp_ns += 1
+        return stamp_ns
 
     def _made(
         self,
@@ -168,21 +176,19 @@ class Sampler:
         **more: Any,
     ) -> Iterator[Numbered]:
         """Yield a sample of measurements (N, ROW_WIDTH), unless one exists or memory is full."""
-        known = self._taken.setdefault(key, {})
-        while stamp_ns in known:
-            if np.abs(unwrapped(joints - known[stamp_ns], self._revolute)).max() <= STILL:
-                self.dropped['measurements: a pose with this stamp already exists'] += len(rows)
-                return
-            stamp_ns += 1
-        if len(known) >= self._capacity:
-            self.dropped['measurements: the memory for poses is full'] += len(rows)
+        free = self._free(key, stamp_ns, joints)
+        known = self._taken[key]
+        if free is None or len(known) >= self._capacity:
+            why = 'a pose with this stamp already exists'
+            why = why if free is None else 'the memory for poses is full'
+            self.dropped[f'measurements: {why}'] += len(rows)
             return
-        known[stamp_ns] = joints
+        known[free] = joints
         covariance = None
         if not np.isnan(rows[:, COVARIANCE_SLICE]).any():
             covariance = rows[:, COVARIANCE_SLICE].mean(axis=0).reshape(6, 6)
         sample = Sample(
-            stamp_ns=stamp_ns,
+            stamp_ns=free,
             joints=joints,
             position=None if key.distance else position,
             distance=float(position[0]) if key.distance else None,

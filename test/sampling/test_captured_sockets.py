@@ -30,6 +30,8 @@ def captured(problem, count=4):
             take(session, *come)
             assert 'the arm stands for' in session.status()
             assert session.capture(f'place {number // 2}/{number % 2}') == (1, '')
+            again = session.capture(f'place {number // 2}/{number % 2}')
+            assert again == (0, 'it was captured already, and no joint states came since')
             assert 'its pose is measured: move on' in session.status()
             now += S
     return session
