@@ -152,7 +152,7 @@ class Measurements:
         found = self
         if self.removed.any():
             open_rows: dict[tuple[int, ...], list[int]] = {}
-            keys = np.column_stack([self.stamps_ns, self.codes[:, :-1]]).tolist()
+            keys = np.column_stack([self.stamps_ns, self.frame_id[0], self.codes[:, :-1]]).tolist()
             for row, (key, removed) in enumerate(zip(keys, self.removed.tolist(), strict=True)):
                 same = open_rows.setdefault(tuple(key), [])
                 if not removed:
@@ -164,7 +164,7 @@ class Measurements:
         stamps = found.stamps_ns
         if (np.diff(stamps) > 0).all():
             return found
-        _, number = distinct_rows(found.codes)
+        _, number = distinct_rows(np.column_stack([found.codes, found.frame_id[0]]))
         order = np.lexsort((number, stamps))
         again = (np.diff(stamps[order]) == 0) & (np.diff(number[order]) == 0)
         for row in np.sort(order[1:][again])[:1].tolist():

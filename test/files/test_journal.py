@@ -130,13 +130,14 @@ def test_kinds_of_one_stop_are_told_apart(tmp_path):
         replace(plain(1), rotation=np.eye(3), eye_in_hand=True),
         replace(plain(1, device='d'), position=None, distance=2.0),
         replace(plain(1, device='d')),
+        plain(1, device='d', frame_id='b'),  # kept, until frame_id chooses one
     ]
     written(tmp_path / 'cell.csv', many)
     assert_equal(read_journal(tmp_path / 'cell.csv', JOINTS)[0], many)
     journal = Journal(tmp_path / 'cell.csv', JOINTS)
     journal.add(many[6], removed=True)
     journal.close()
-    assert_equal(read_journal(tmp_path / 'cell.csv', JOINTS)[0], [*many[:6], many[7]])
+    assert_equal(read_journal(tmp_path / 'cell.csv', JOINTS)[0], [*many[:6], *many[7:]])
 
 
 def test_of_rows_alike_the_last_is_taken_back_and_the_rest_keep_their_order(tmp_path):
