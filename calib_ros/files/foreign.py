@@ -137,10 +137,11 @@ class _Table:
             if chain is not None or not of_joint or ours == 'q1':
                 needed |= dict.fromkeys(asked[ours].names)
         own: dict[str, str] = {}  # names that need no layout, and ours
+        called = chain.joint_names if joints and chain is not None else ()
+        ours_of = joint_columns(len(called))
         if joints:
             own = {name: name for name in joint_columns(most, 'qsva')}
-            called = () if chain is None else chain.joint_names
-            own |= zip(called, joint_columns(len(called)), strict=True)
+            own |= zip(called, ours_of, strict=True)
         if not alone:
             own |= {name: name for name in (*NUMBERS, *WORDS)}
         self._sheet = read_sheet(path, layout, list(needed), list(own))
@@ -150,6 +151,9 @@ class _Table:
         self._sheet, self.count = replace(self._sheet, columns=kept), len(kept.lines)
         self.notes = [*self._sheet.notes, *left]
         self._columns = self._asked(asked, optional)
+        low = {name.lower() for name in self.names}
+        if {*map(str.lower, called)} <= low and not {*ours_of} <= low:  # q1 ... of a quaternion
+            own = {name: own[name] for name in own if name not in {*ours_of} - {*called}}
         if not alone:
             own |= {name: ours for ours, name in quaternions_in(self.names).items()}
         named = self._named({name: own[name] for name in own if own[name] not in asked})

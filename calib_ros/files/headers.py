@@ -21,6 +21,7 @@ from calib_ros.files.names import (
     words_of,
 )
 from calib_ros.files.vocabulary import (
+    COVARIANCE,
     NUMBERS,
     POSITION,
     SEPARATORS,
@@ -111,7 +112,9 @@ def named_by_option(
     lacking = [name for name in names if name in missing]
     whole = 0 < joints == len(lacking)
     fewer = bool(lacking) and 'q1' in header and 'q0' not in header
-    like = like_joints(header, joints) if lacking and not fewer else {}
+    ours = (*names, *COVARIANCE) if fewer else ()  # q1 to q4 may be a quaternion
+    like = like_joints([name for name in header if name not in ours], joints) if lacking else {}
+    fewer = fewer and not like
     more = '; joint values in another file: --joints FILE' if whole and not like else ''
     found = dict.fromkeys([name for name in missing if name not in lacking], 'NAME')
     found |= positions_in(header, [name for name in POSITION if name in missing])

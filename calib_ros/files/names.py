@@ -103,6 +103,13 @@ def in_doubt(header: Sequence[str], plain: Sequence[str], joints: int = 0) -> st
 
     These are coordinates in columns with `plain` names, and the values of joints in q1, q2 ...
     """
+    for ours in (plain and POSITION, joint_columns(joints)):
+        capitals = [name.upper() for name in ours]
+        if ours and {*ours, *capitals} <= {*header}:
+            return (
+                f'{ours[0]} may be nominal beside {capitals[0]}: give '
+                f'{option(ours, capitals)}, or {option(ours, ours)} if it was measured'
+            )
     known = groups(header, 'xyz', without=TURNED | OTHER)
     measured, nominal, apart = (
         [names for words, names in known.items() if words & some]

@@ -93,6 +93,7 @@ def test_what_is_no_expression(text):
             ['q1', 'c11', 'c12', 'y', 'z'],
             'Is it another arm (--chain)? Columns of other names: --columns "q2=NAME"',
         ),
+        (['q1', 'J1', 'J2', 'y', 'z'], 'other names: --columns "q*=J*"'),
         (['J1 [°]', 'J2 [°]', 'x [mm]', 'y (mm)', 'z / mm'], 'other names: --columns "q*=J*"'),
         (['q0', 'q1', 'x', 'y', 'z'], '--columns "q1=q0,q2=q1"'),
         (['j_0', 'j_1', 'x', 'y', 'z'], '--columns "q1=j_0,q2=j_1"'),

@@ -135,6 +135,26 @@ def test_other_values_are_not_taken_for_measured_joints(tmp_path, first, second)
     assert_same(proposed(path), None)
 
 
+@pytest.mark.parametrize('names', [('q1', 'q2'), ('x', 'y', 'z')])
+def test_names_in_capitals_beside_small_ones_are_in_doubt(tmp_path, names):
+    """The small ones were read, with a note that the others were not."""
+    path = tmp_path / 'cell.csv'
+    right = JOINTS if names[0] == 'q1' else PLACES
+    given = [*NAMES, *map(str.upper, names)]
+    wrong = [each + 0.01 if each is right else each for each in (JOINTS, PLACES)]
+    path.write_text(text_of(*wrong, right, names=given))
+    assert_same(proposed(path), None)
+
+
+def test_joints_by_their_names_are_not_mixed_with_ours(tmp_path):
+    """q1 to q4 of a quaternion, as ABB names them, were the first four joints."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(text_of(JOINTS, PLACES, PLACES[:, :1], names=[*ARM.joint_names, *'xyz', 'q1']))
+    table = loading.table(path, ARM, Settings())
+    assert_same(table, None)
+    assert 'columns not read: q1 (' in str(table.warnings)
+
+
 @pytest.mark.parametrize('form', ['joint{}_speed', 'J{}_torque', 'A{}_power', 'q{}_act_current'])
 def test_other_values_are_never_proposed_for_joints(tmp_path, form):
     path = tmp_path / 'cell.csv'
