@@ -39,7 +39,7 @@ def name_and_unit(cell: str) -> tuple[str, str]:
     unit = '' if match is None else next(filter(None, match.groups()[1:])).strip()
     if match is None or {*words_of(unit)} & (MEASURED_WORDS | NOMINAL_WORDS):
         return cell, ''
-    return match[1], UNIT_SIGNS.get(unit.lower(), unit)
+    return match[1].removesuffix(' in'), UNIT_SIGNS.get(unit.lower(), unit)
 
 
 def places(header: Sequence[str], name: str) -> list[int]:

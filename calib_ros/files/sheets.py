@@ -14,7 +14,7 @@ import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from itertools import chain, zip_longest
+from itertools import accumulate, chain, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -154,7 +154,8 @@ def _sheet(
     first = _first(path, head, at, used, decimal, notes)
     if at < 0 and first:  # columns by their numbers
         header = tuple(f'#{k + 1}' for k in range(len(head[first][1])))
-    header = _with_units(header, [cells for _, cells in head[at + 1 : first]])
+    of_groups = [_over_groups(cells) for _, cells in head[max(at - 1, 0) : max(at, 0)]]
+    header = _with_units(header, [*(cells for _, cells in head[at + 1 : first]), *of_groups])
     above = ['\t'.join(cells) for _, cells in head[: first if at < 0 else at]]
     left: list[int] = []
     again = [cells for _, cells in head[at:first]]
@@ -239,6 +240,15 @@ def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tupl
             for name, unit in pairs
         )
     return header
+
+
+def _over_groups(cells: Sequence[str]) -> list[str]:
+    """Return the line above a header, cells over blank ones too; empty without several units."""
+    units = [UNIT_SIGNS.get(c.strip('[]() ').lower()) or name_and_unit(c)[1] for c in cells]
+    if sum(unit in UNIT_SIGNS for unit in units) < 2 or any(_is_number(c, ',') for c in cells):
+        return []
+    whole: Iterator[str] = accumulate(cells, lambda before, cell: cell or before)
+    return [*whole]
 
 
 def _text(path: Path) -> tuple[str, str]:

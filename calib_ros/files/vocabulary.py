@@ -14,7 +14,8 @@ LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254, 'ft': 0.3
 """Metres in units of length."""
 ANGLES = {'rad': 1.0, 'deg': np.pi / 180.0}  # radians in units of angle
 LONG = {'degree': 'deg', 'radian': 'rad', 'meter': 'm', 'centimeter': 'cm', 'millimeter': 'mm'}
-LONG |= {'micrometer': 'um'}
+LONG |= {'micrometer': 'um', 'micron': 'um'}
+LONG |= {f'{word[:-2]}re': unit for word, unit in LONG.items() if word.endswith('meter')}
 UNIT_SIGNS = {word + s: unit for word, unit in LONG.items() for s in ('', 's')}
 UNIT_SIGNS |= {'°': 'deg', 'µm': 'um', 'μm': 'um', 'inch': 'in', 'inches': 'in'}
 UNIT_SIGNS |= {'foot': 'ft', 'feet': 'ft'}
