@@ -20,15 +20,15 @@ from calib_ros.values import ROUNDED
 
 _MEAN = (
     r'(\w+[ _-])?(mean|average|avg|mittel(wert)?|moyenne|m[eé]dia|promedio|平均[値值]?)'
-    r'( value| of [\w ]+)?'
+    r'( value| error| of [\w ]+)?'
 )
 _OTHERS = (
-    r'median|max|maximum|min|minimum|range|spannweite|sum|total|summe|gesamt|count|anzahl|rms'
-    r'|st(andar)?d?[. -]*(dev(iation)?|err(or)?|abw(eichung)?)|std|sd|([1-6] ?)?sigma'
+    r'median|max|maximum|min|minimum|range|spannweite|sum|total|summe|gesamt|count|anzahl'
+    r'|rms( error)?|st(andar)?d?[. -]*(dev(iation)?|err(or)?|abw(eichung)?)|std|sd|([1-6] ?)?sigma'
     r'|var(iance)?|varianz|[ée]cart[- ]type|standardabweichung|標準偏差|标准差|tolerance|toleranz'
 )
 MEAN, STATISTIC = (
-    re.compile(rf'(?:\A|{BETWEEN})\s*(?:{names})[ :.]*(?={BETWEEN}|\Z)', re.I)
+    re.compile(rf'(?:\A|{BETWEEN})\s*(?:{names})( ?[\[(]\S+[\])])?[ :.]*(?={BETWEEN}|\Z)', re.I)
     for names in (_MEAN, f'{_MEAN}|{_OTHERS}')
 )
 """Names of rows that hold no pose, and of those that may hold one."""
