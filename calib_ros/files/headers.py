@@ -103,8 +103,13 @@ def named_by_option(
 
     The joints may be `called` as the positions, in a gantry: these are named too.
     """
-    if several := [name for name in missing if header.count(name) > 1]:
-        return f'Several columns are called {", ".join(several)}: rename all but one'
+    low = [name.lower() for name in header]
+    if several := [name for name in missing if low.count(name) > 1]:
+        first, *again = (f'#{k}' for k, name in enumerate(low, 1) if name == several[0])
+        return (
+            f'Several columns are called {", ".join(several)}: rename all but one, or give each '
+            f'by its number: --columns {several[0]}={first} (or {", ".join(again)})'
+        )
     if only_numbers(header):
         given = option(missing, [f'#{k}' for k in range(1, len(missing) + 1)])
         return f'Its first line holds numbers, not names: {given}, in its order'

@@ -93,6 +93,7 @@ def test_what_is_no_expression(text):
             ['q1', 'c11', 'c12', 'y', 'z'],
             'Is it another arm (--chain)? Columns of other names: --columns "q2=NAME"',
         ),
+        (['q1', 'q2', 'X', 'X', 'y'], 'by its number: --columns x=#3 (or #4)'),
         (['q1', 'J1', 'J2', 'y', 'z'], 'other names: --columns "q*=J*"'),
         (['J1 [°]', 'J2 [°]', 'x [mm]', 'y (mm)', 'z / mm'], 'other names: --columns "q*=J*"'),
         (['q0', 'q1', 'x', 'y', 'z'], '--columns "q1=q0,q2=q1"'),
@@ -169,7 +170,7 @@ def test_each_column_has_its_own_unit(tmp_path, head, row):
         ('q1,q2,x [yd],y,z', r'x = x \[yd\] cannot be in yd, .*: give --length, or convert it'),
         ('q1,q2,x,y,z\nrad,rad,yd,mm,mm', r'x = x \[yd\] cannot be in yd, .*: give --length, or'),
         ('q1,q2,x [mm],y [m],z', 'z has no unit, others are in m and mm'),
-        ('q1,q2,x [mm],x,y', 'Several columns are called x'),
+        ('q1,q2,x [mm],x,y', r'Several columns are called x: .*--columns x=#3 \(or #4\)'),
         ('q1,Y [m],X [mm],y,z', r'x = X\+Y mixes m and mm'),
     ],
 )
