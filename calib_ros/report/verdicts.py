@@ -20,7 +20,7 @@ from calib_ros.report.advice import SPREAD_OUT
 from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import Poses
-from calib_ros.report.words import interval_mm
+from calib_ros.report.words import interval_mm, turned_in_words
 from calib_ros.settings import Settings
 from calib_ros.shown import rounded, sentence, some
 
@@ -119,14 +119,8 @@ def caveats(found: Verification) -> list[str]:
             'this judges the calibration, not the corrected robot: give the uncorrected program '
             '(--commanded) to test whether the correction reaches the arm'
         )
-    turned = found.comparison.figures[1].rms_mrad
-    moved = found.common < NEARER
-    if turned is not None and turned > 1e3 * Settings.largest_angle and not moved:
-        lines.append(
-            f'the orientations are {turned:.0f} mrad off, but only positions are judged: check '
-            'their format (order of the quaternion or angles, degrees) and the target'
-        )
-    return lines
+    turned = turned_in_words(found.comparison.figures[1])
+    return [*lines, turned] if turned and found.common >= NEARER else lines
 
 
 def remarks(found: Verification) -> list[str]:

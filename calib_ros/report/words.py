@@ -213,7 +213,19 @@ def verdict(
     if most > limit:
         text = f'too few poses to tell whether the calibration holds: {text}; measure more'
         return 'UNDECIDED', text
-    return 'holds', f'the calibration holds: {text}'
+    turned = turned_in_words(now)
+    return 'holds', f'the calibration holds: {text}' + f'; but {turned}' * bool(turned)
+
+
+def turned_in_words(figures: ErrorFigures) -> str:
+    """Return that measured orientations fit no arm; empty if they do, or without any."""
+    turned = figures.rms_mrad or 0.0
+    if turned <= 1e3 * Settings.largest_angle:
+        return ''
+    return (
+        f'the orientations are {turned:.0f} mrad off, but only positions are judged: check '
+        'their format (order of the quaternion or angles, degrees) and the target'
+    )
 
 
 def _least_and_most(found: Comparison, when: int) -> tuple[float, float]:

@@ -46,6 +46,9 @@ def test_a_calibration_holds_by_one_rule(rms_mm, says):
     assert told[0] == says
     assert '; the limit is 0.150 mm' in told[1]
     assert told[1].startswith('too few poses to tell') == (says == 'UNDECIDED')
+    turned = replace(off, orientation=np.ones((20, 3)))
+    _, text = verdict(previous, Comparison(turned, turned, both.judged))
+    assert ('the orientations are 1732 mrad off' in text) == (says == 'holds')
     same = still_holds(previous, updates[0])
     assert same[0] == (says != 'does not hold')
     for text in (told[1], same[1]):
