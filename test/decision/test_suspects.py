@@ -11,7 +11,7 @@ import pytest
 from fits import SCARA
 
 from calib_ros import Problem, identify, load_chain
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.printed_board import size_of
 from calib_ros.decision.suspects import hidden, suspects
 from calib_ros.decision.undoing import Suspect, mirrored
@@ -57,6 +57,8 @@ def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
     seen = measure(held, rail.random_joints(20, rng), rng)
     found = {each.what: (each.rank, each.part) for each in suspects(held, (seen,))}
     assert {what: found.get(what) for what in RANKS} == RANKS
+    ends = [e.remedy for e in suspects(held, (seen,)) if 'leave this joint out' in e.remedy]
+    assert [each.split()[-1] for each in ends] == ['q1=0', 'q7=0']  # of the seven columns
     assert 'the coordinates x, y, z of the positions are -x, -y, -z' not in found  # left-handed
     assert (
         'shoulder_pan_joint is not given against linear_axis_joint: they are coupled' not in found
@@ -204,6 +206,16 @@ def test_ways_to_write_a_pose_are_undone_in_the_poses_as_measured(what, written,
         (undone,) = found.undone((spoilt,))
         for name in ('joints', 'positions', 'rotations'):
             np.testing.assert_allclose(getattr(undone, name), getattr(given, name), atol=1e-9)
+
+
+def test_another_robot_stands_where_the_given_one_is_said_to(rng):
+    """And carries its target; nothing else is told of frames that are given."""
+    base, tool = (Frame(random_frame(rng, 1.0).matrix, fixed=True) for _ in range(2))
+    arm = replace(load_chain('ur10e'), base=base, tool=tool)
+    seen = measure(arm, arm.random_joints(9, rng), rng)
+    others = [each.chain for each in suspects(arm, (seen,)) if each.what.startswith('the arm is')]
+    assert len(others) > 3
+    assert all((each.base, each.tool) == (base, tool) for each in others)
 
 
 def test_a_mirror_turns_one_axis_round_and_nothing_else(rng):
