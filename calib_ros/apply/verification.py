@@ -34,7 +34,7 @@ from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.decision import mistakes
 from calib_ros.decision.comparison import Comparison, compare
-from calib_ros.decision.steps import Step
+from calib_ros.decision.moved import Step
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.levels import CONFIDENT

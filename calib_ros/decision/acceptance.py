@@ -14,9 +14,9 @@ import numpy as np
 from scipy import special
 
 from calib_ros.decision.comparison import COUNTS, Comparison, log_gain, mean_squares
+from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
-from calib_ros.decision.steps import Step
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, CONFIDENT, MOST_OUTLIERS

@@ -13,9 +13,9 @@ from scipy import special
 from calib_ros.annotated import Count, NotNegative, Share, as_annotated
 from calib_ros.decision.comparison import Comparison, GroupVerdict
 from calib_ros.decision.misfits import Outlier
+from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason
 from calib_ros.decision.region import Region
-from calib_ros.decision.steps import Step
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.fitted import ParameterRow

@@ -15,18 +15,19 @@ Products of all columns are summed from the end of the session and serve every s
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 
 from calib_ros.decision.drift import gain_of, inverse_root, slow_cosines
-from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision.imitations import LEAST, Imitation
+from calib_ros.decision.moved import FRAMES, Step, thing_of
 from calib_ros.estimation.configurations import stops
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import SOME
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
 from calib_ros.estimation.levels import LEAST_ASIDE, SURE, chance_of
-from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import SUSPICIOUS, weights_of
 from calib_ros.estimation.samples import gram
@@ -34,79 +35,9 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.settings import EXCEPTION
-from calib_ros.shown import rows_in_words
 
-FRAMES = ('base', 'tool')
-OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
 EXPLAINED = 0.5
 """Share of the squared residuals that an explanation needs: most of them (benchmarks/harm.py)."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """What moved, when and by how much.
-
-    A base or tool frame, a joint, all joints or the load (`kind`: 'base', 'tool', 'joint',
-    'joints' or 'load'); `thing` names the device or target there. `set`, `sample`, its `image` and
-    `stamp_ns` belong to the first sample after the step. `size` is the RMS change of positions
-    ('m') or, if that weighs more, orientations ('rad'); of a joint that of its zero. `share` is
-    its share of the squared residuals beyond that of as many useless parameters. If all
-    measurements on one side are outliers, `unused` says which: the fit of frames is not affected.
-    If the arm's places before and after lie `apart`, errors of the arm look like a step.
-    """
-
-    what: str
-    kind: str
-    thing: str
-    set: int
-    sample: int
-    stamp_ns: int
-    size: float
-    unit: str
-    share: float
-    unused: str
-    image: int | None = None
-    apart: bool = False
-    held: bool = False
-    """Whether a frame that the chain file holds is wrong from the first pose on."""
-
-    @property
-    def harmful(self) -> bool:
-        """Tell whether the step spoils the fit: it mixes two arms, or describes a past one."""
-        return self.kind not in FRAMES or not self.unused
-
-    def __str__(self) -> str:
-        return str(self.reason)
-
-    @property
-    def reason(self) -> Reason:
-        """Return the reason to refuse a result."""
-        where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
-        where += f' of set {self.set + 1}' if self.set else ''
-        when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
-        line = rows_in_words([0], np.array([self.stamp_ns]))
-        if line.startswith('line'):  # instead of a clock
-            where = line if self.image is None else f'{where}, {line}'
-            when = 'if rows are in the order of measurement'
-        size = f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
-        if self.held:
-            off = f'the {self.what} held by the chain file is off {size}'
-            return Reason(Rule.MISTAKE, f'{off}: correct it, or remove fixed: true there')
-        thing, of = self.thing, f' ({self.what})'
-        if self.kind == 'joint':
-            thing, of = f'the zero of {self.what}', ''
-        text, more = f'{thing} moved {size}{of} before {where}', f' ({when})'
-        if self.kind in OF_THE_ARM:
-            text, more = f'{thing} changed before {where}', f' ({when}): poses differ {size}'
-        if self.kind == 'load':
-            more += '; measure with one load, or fit only the poses before or only those after'
-        if self.unused:
-            more += f'; measurements {self.unused} carry no weight'
-        if self.apart:
-            more += (
-                '; errors of the arm may look so, as poses before and after lie apart: mix them'
-            )
-        return Reason(Rule.ENCODER if self.kind.startswith('joint') else Rule.MOVED, text, more)
 
 
 def find_step(fitted: Fitted, held: bool = False) -> Step | None:
@@ -116,10 +47,14 @@ def find_step(fitted: Fitted, held: bool = False) -> Step | None:
     """
     if held and _Scan(fitted, loaded=True, gross=True).explained:
         return None
-    scan, found = _searched(fitted, loaded=False)
+    plain, found = _searched(fitted, loaded=False)
+    scan = plain
     if found is None and fitted.noise.position >= SUSPICIOUS:
         scan, found = _searched(fitted, loaded=True)
-    return None if found is None or scan.drifts(found) else scan.described(found)
+    if found is not None:
+        return None if scan.drifts(found) else scan.described(found)
+    found = plain.imitated(fitted)
+    return None if found is None else plain.described(found)
 
 
 def _searched(fitted: Fitted, loaded: bool, gross: bool = True) -> tuple[_Scan, _Found | None]:
@@ -159,7 +94,8 @@ class _Group:
 class _Found:
     """A step: its group, its first stop, and its size by parameter.
 
-    `share` is the explained share of the squares, `variance` the rest per degree of freedom.
+    `share` is the explained share of the squares, `variance` the rest per degree of freedom; of a
+    move that the arm imitates they are 1 and 0.
     """
 
     group: _Group
@@ -204,7 +140,8 @@ class _Scan:
         extra = extra[~extra[:, held].any(axis=1)]  # a step may free a zero held too tightly
         self._given = extra.T @ extra  # products of priors
         whole = np.array([gram(rows) for rows in self._rows])
-        matrix = whole.sum(axis=0)[: self._fitted, [*range(self._fitted), -1]] + self._given[:-1]
+        self._products = whole.sum(axis=0)[: self._fitted, [*range(self._fitted), -1]]
+        matrix = self._products + self._given[:-1]
         self._root = inverse_root(matrix[:, :-1], np.diag(matrix))
         self._known = self._root.T @ matrix[:, -1]
         left = np.zeros(len(self._names) + 1)
@@ -227,19 +164,25 @@ class _Scan:
         """Return the best step, if it explains most of the squares."""
         if self.explained:  # by what is wrong from the first pose on
             return None
-        some = _some_places(self._stops)
-        if any(group.held for group in self._groups):
-            some = np.concatenate([[0], some])
-        near = self._best_of(some, 0.5 * EXPLAINED) if len(some) else None
+        some, products = self._coarse
+        near = self._best_of(some, products, 0.5 * EXPLAINED) if len(some) else None
         if near is None or near.stop == 0:
             return near if near is not None and near.share > EXPLAINED else None
         first = some[some < near.stop].max(initial=LEAST_ASIDE)
         last = some[some > near.stop].min(initial=self._stops - LEAST_ASIDE)
-        return self._best_of(np.arange(first, last + 1), EXPLAINED)
+        places = np.arange(first, last + 1)
+        return self._best_of(places, self._to_the_end(places), EXPLAINED)
 
-    def _best_of(self, places: Index, least: float) -> _Found | None:
+    @cached_property
+    def _coarse(self) -> tuple[Index, FloatArray]:
+        """Return stops for a coarse search, and products from each to the end."""
+        some = _some_places(self._stops)
+        if any(group.held for group in self._groups):
+            some = np.concatenate([[0], some])
+        return some, self._to_the_end(some)
+
+    def _best_of(self, places: Index, products: FloatArray, least: float) -> _Found | None:
         """Return the best step at some stops, if it explains that share of the squares."""
-        products = self._to_the_end(places)
         own = products[:, :, [self._names.index(name) for name in self._added]]
         cross = products[:, :, : self._fitted] @ self._root
         matrix = own - cross @ np.swapaxes(cross, 1, 2)
@@ -270,6 +213,35 @@ class _Scan:
                 lowest, size = criterion, root[k] @ along[k]
                 found = _Found(group, int(places[k]), size, float(beyond), float(left * rest))
         return found
+
+    def imitated(self, fitted: Fitted) -> _Found | None:
+        """Return the move of a frame that the arm imitates, if any."""
+        some, every = self._coarse
+        if not len(some) or all(map(self._chain.owns_frame, fitted.names)):
+            return None
+        arm = Imitation(fitted, self._names[: self._fitted], self._products)
+        highest, found = LEAST, None
+        groups = [each for each in self._groups if each.kind in FRAMES and not each.held]
+        trials = np.log(self._stops * len(self._groups))
+        for group in groups:
+            gains = arm.gains(*self._moving(group, every))
+            k = int(np.argmax(gains))
+            if gains[k] < LEAST + trials:
+                continue
+            first, last = some[max(k - 1, 0)], some[min(k + 1, len(some) - 1)]
+            first = max(first, LEAST_ASIDE)
+            rows, own = self._moving(group, self._to_the_end(np.arange(first, last + 1)))
+            k = int(np.argmax(arm.gains(rows, own)))
+            odds, size = arm.against(rows[k], own[k])
+            if odds - trials > highest:
+                highest, found = odds - trials, _Found(group, int(first) + k, size, 1.0, 0.0)
+        return found
+
+    def _moving(self, group: _Group, products: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return products (B, K, P + 1) of a frame's moves with the fit, and (B, K, K)."""
+        own = products[:, [self._added.index(name) for name in group.names]]
+        columns = [self._names.index(name) for name in group.names]
+        return own[:, :, [*range(self._fitted), -1]], own[:, :, columns]
 
     def _to_the_end(self, places: Index) -> FloatArray:
         """Return products (B, K, P + 1) of moved columns with all, from each stop to the end."""
@@ -341,7 +313,7 @@ class _Scan:
         return Step(
             what=group.what,
             kind=group.kind,
-            thing=_thing(group.kind, seen),
+            thing=thing_of(group.kind, seen),
             set=of_set,
             sample=int(sample),
             stamp_ns=int(stamp),
@@ -361,17 +333,6 @@ def _apart(joints: FloatArray, after: Flags) -> bool:
     left = side - centred @ np.linalg.lstsq(centred, side, rcond=None)[0]
     freedom = len(joints) - joints.shape[1] - 1
     return bool(left @ left * (len(joints) - 1) < EXCEPTION * freedom * (side @ side))
-
-
-def _thing(kind: str, seen: Observations) -> str:
-    if kind not in FRAMES:
-        return OF_THE_ARM.get(kind, 'the joint')
-    of_images = seen.pixels is not None
-    target = ['the board' if of_images else 'the target']
-    device = ['the camera', 'its lens'] if of_images else ['the measuring device']
-    on_flange, other = (device, target) if seen.inverse or seen.on_flange else (target, device)
-    *first, last = on_flange if kind == 'tool' else [*other, "the robot's foot"]
-    return f'{", ".join(first)} or {last}' if first else last
 
 
 def _of_the_arm(problem: Problem) -> list[_Group]:

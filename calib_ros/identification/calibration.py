@@ -29,9 +29,10 @@ import numpy as np
 
 import calib_ros
 from calib_ros.annotated import as_annotated
+from calib_ros.decision.moved import Step
 from calib_ros.decision.region import Region, packed, region_of_record, rows_of
 from calib_ros.decision.result import Identification
-from calib_ros.decision.steps import Step, find_step
+from calib_ros.decision.steps import find_step
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled

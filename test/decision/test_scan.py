@@ -11,7 +11,8 @@ from fits import NOISE, SIGMAS, UR10E, arm
 from calib_ros import Problem
 from calib_ros.apply.simulation import measure
 from calib_ros.decision import steps
-from calib_ros.decision.steps import Step, find_step
+from calib_ros.decision.moved import Step
+from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
 from calib_ros.estimation.levels import LEAST_ASIDE, SURE

@@ -116,6 +116,24 @@ def test_a_step_of_simulated_measurements_without_noise_is_all_that_is_left():
     assert step.share == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize('seed', [3, 4])
+def test_a_move_that_the_arm_imitates_is_named(seed):
+    """Between stations whose wrist poses alone vary, no residual was left."""
+    rng = np.random.default_rng(seed)
+    true = arm(rng)
+    stations = rng.uniform(-1.0, 1.0, 6) + np.cumsum(rng.uniform(-0.15, 0.15, (3, 6)), axis=0)
+    q = np.repeat(stations, 25, axis=0)
+    wrist = 0.17 * np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), axis=-1)
+    q[:, 4:] += np.tile(wrist.reshape(25, 2), (3, 1))
+    q += rng.normal(scale=3e-4, size=q.shape)
+    seen = measure(true, q, rng, *NOISE)
+    assert identify(Problem(UR10E, seen, **SIGMAS)).accepted
+    result = identify(Problem(UR10E, moved(seen, true, 'base', 1e-3, at=25), **SIGMAS))
+    assert not result.accepted
+    assert (result.step.kind, result.step.sample) == ('base', 25)
+    assert result.step.size == pytest.approx(1e-3, rel=0.1)
+
+
 def test_a_bumped_target_is_no_gain_of_a_healthy_arm():
     """Along sweeps a bump of 0.3 mm passes for an error of the arm on poses left out."""
     named = 0

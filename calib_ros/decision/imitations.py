@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Does the arm imitate a frame that moved? By the evidence for errors of an arm (`sizes.py`).
+
+If the poses before a move and those after it lie apart, the arm's parameters explain it and leave
+no residual, but with offsets much larger than those of this arm without the move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import special
+
+from calib_ros.decision.drift import inverse_root
+from calib_ros.estimation.evidence import size_group
+from calib_ros.estimation.fitted import Fitted
+from calib_ros.estimation.levels import NEARER, SURE
+from calib_ros.estimation.sizes import TYPICAL, Evidence
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+
+MOVE = TYPICAL['angle']
+"""Size [m, rad] of the moves of a frame, within a factor of ten (assumed)."""
+LEAST = float(special.logit(SURE))
+"""Log odds, for as many possible moves as there are, from which one is named."""
+
+
+class Imitation:
+    """The arm's fit without a move, by products (P, P + 1) of its columns with all and residual.
+
+    `names` are those of the columns.
+    """
+
+    def __init__(self, fitted: Fitted, names: Sequence[str], products: FloatArray) -> None:
+        chain, model, known = fitted.chain, fitted.problem.model, fitted.problem.given
+        self._groups = [None if n in known else size_group(chain, n) for n in names]
+        self._given = np.array([known.get(name, np.inf) for name in names]) ** -2.0
+        self._frames = np.array([chain.owns_frame(name) for name in names])
+        self._offsets = np.array(
+            [0.0 if chain.owns_frame(n) else chain.offset(n, model) for n in names]
+        )
+        self._variance = max(fitted.size, ROUNDING) ** 2
+        self._matrix, self._vector = self._about_nominal(products)
+        typical = np.array([TYPICAL[g] if g else np.inf for g in self._groups])
+        matrix = self._matrix + np.diag(self._given + typical**-2.0)
+        self._root = inverse_root(matrix, np.diag(matrix))
+        self._fit = self._root.T @ self._vector
+
+    def _about_nominal(self, products: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return products (..., P) of columns, and (...) with the residual of the nominal arm."""
+        scaled = products / self._variance
+        matrix = scaled[..., :-1]
+        return matrix, matrix @ self._offsets + scaled[..., -1]
+
+    def gains(self, products: FloatArray, own: FloatArray) -> FloatArray:
+        """Return half the squares (B,) that moves spare an arm with errors of the usual sizes.
+
+        By products (B, K, P + 1) of their columns with the others, and (B, K, K) with each other.
+        """
+        cross, vector = self._about_nominal(products)
+        along = cross @ self._root
+        left = own / self._variance - along @ np.swapaxes(along, 1, 2)
+        left += MOVE**-2.0 * np.eye(own.shape[-1])
+        vector = vector - along @ self._fit
+        spared = np.linalg.solve(left, vector[..., np.newaxis])[..., 0]
+        return np.asarray(0.5 * np.einsum('bk,bk->b', vector, spared))
+
+    def against(self, products: FloatArray, own: FloatArray) -> tuple[float, FloatArray]:
+        """Return the log odds of one move, and its size (K,); by products without B.
+
+        Nothing speaks for a move that leaves the arm nearly as it is.
+        """
+        cross, vector = self._about_nominal(products)
+        matrix = np.block([[self._matrix, cross.T], [cross, own / self._variance]])
+        given = np.append(self._given, np.zeros(len(cross)))
+        groups, typical = [*self._groups, *['moved'] * len(cross)], TYPICAL | {'moved': MOVE}
+        still = Evidence(self._matrix, self._vector, self._given, self._groups, TYPICAL)
+        moved = Evidence(matrix, np.append(self._vector, vector), given, groups, typical)
+        odds, mean, _ = moved.against(still, still.most_probable(set())[0], set())
+        found, size = np.split(mean, [len(self._offsets)])
+        off, far = (self._distance(each) for each in (self._offsets - found, found))
+        return (odds if off > NEARER * far else -np.inf), size
+
+    def _distance(self, offsets: FloatArray) -> float:
+        """Return the RMS effect of offsets (P,), in the best frames, but for a factor."""
+        arm, frames = ~self._frames, self._frames
+        placed = self._matrix[np.ix_(frames, frames)]
+        moved = self._matrix[:, arm] @ offsets[arm]
+        along = inverse_root(placed, np.diag(placed)).T @ moved[frames]
+        return float(np.sqrt(max(offsets[arm] @ moved[arm] - along @ along, 0.0)))

@@ -1,0 +1,95 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What moved during the session, in words (`steps.py` finds it)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.estimation.observations import Observations
+from calib_ros.shown import rows_in_words
+
+FRAMES = ('base', 'tool')
+OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
+
+
+@dataclass(frozen=True)
+class Step:
+    """What moved, when and by how much.
+
+    A base or tool frame, a joint, all joints or the load (`kind`: 'base', 'tool', 'joint',
+    'joints' or 'load'); `thing` names the device or target there. `set`, `sample`, its `image` and
+    `stamp_ns` belong to the first sample after the step. `size` is the RMS change of positions
+    ('m') or, if that weighs more, orientations ('rad'); of a joint that of its zero. `share` is
+    its share of the squared residuals beyond that of as many useless parameters. If all
+    measurements on one side are outliers, `unused` says which: the fit of frames is not affected.
+    If the arm's places before and after lie `apart`, errors of the arm look like a step.
+    """
+
+    what: str
+    kind: str
+    thing: str
+    set: int
+    sample: int
+    stamp_ns: int
+    size: float
+    unit: str
+    share: float
+    unused: str
+    image: int | None = None
+    apart: bool = False
+    held: bool = False
+    """Whether a frame that the chain file holds is wrong from the first pose on."""
+
+    @property
+    def harmful(self) -> bool:
+        """Tell whether the step spoils the fit: it mixes two arms, or describes a past one."""
+        return self.kind not in FRAMES or not self.unused
+
+    def __str__(self) -> str:
+        return str(self.reason)
+
+    @property
+    def reason(self) -> Reason:
+        """Return the reason to refuse a result."""
+        where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
+        where += f' of set {self.set + 1}' if self.set else ''
+        when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
+        line = rows_in_words([0], np.array([self.stamp_ns]))
+        if line.startswith('line'):  # instead of a clock
+            where = line if self.image is None else f'{where}, {line}'
+            when = 'if rows are in the order of measurement'
+        size = f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
+        if self.held:
+            off = f'the {self.what} held by the chain file is off {size}'
+            return Reason(Rule.MISTAKE, f'{off}: correct it, or remove fixed: true there')
+        thing, of = self.thing, f' ({self.what})'
+        if self.kind == 'joint':
+            thing, of = f'the zero of {self.what}', ''
+        text, more = f'{thing} moved {size}{of} before {where}', f' ({when})'
+        if self.kind in OF_THE_ARM:
+            text, more = f'{thing} changed before {where}', f' ({when}): poses differ {size}'
+        if self.kind == 'load':
+            more += '; measure with one load, or fit only the poses before or only those after'
+        if self.unused:
+            more += f'; measurements {self.unused} carry no weight'
+        if self.apart:
+            more += (
+                '; errors of the arm may look so, as poses before and after lie apart: mix them'
+            )
+        return Reason(Rule.ENCODER if self.kind.startswith('joint') else Rule.MOVED, text, more)
+
+
+def thing_of(kind: str, seen: Observations) -> str:
+    """Return what moves with a frame, in words; `kind` as in `Step`."""
+    if kind not in FRAMES:
+        return OF_THE_ARM.get(kind, 'the joint')
+    of_images = seen.pixels is not None
+    target = ['the board' if of_images else 'the target']
+    device = ['the camera', 'its lens'] if of_images else ['the measuring device']
+    on_flange, other = (device, target) if seen.inverse or seen.on_flange else (target, device)
+    *first, last = on_flange if kind == 'tool' else [*other, "the robot's foot"]
+    return f'{", ".join(first)} or {last}' if first else last
