@@ -40,11 +40,6 @@ from calib_ros.shown import Shown
 
 Mixed: TypeAlias = tuple[float, FloatArray, FloatArray]
 """A weight, with mean (P,) and covariance (P, P) of the offsets."""
-_Equations: TypeAlias = tuple[FloatArray, FloatArray]
-"""A matrix (K, K) and vector (K,) of normal equations."""
-_Follow: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-"""How T waves follow K columns: slopes (T, K), subtracted, then mean (T,) and covariance (T, T)
-for zeros; in units of their size."""
 
 
 def size_group(chain: Chain, name: str) -> str | None:
@@ -134,134 +129,122 @@ class Posterior(Shown):
         return variance / self.priors[name] ** 2 if name in self.priors else 0.0
 
 
-class Linearised:
-    """Columns of a fitted arm and of `more` considered effects, linearised at the fit.
+def posterior_of(
+    fitted: Fitted,
+    noise: float,
+    more: Sequence[str] = (),
+    rounding: Mapping[str, float] | None = None,
+    judging: bool = True,
+) -> Posterior:
+    """Return the posterior of a fit and of `more` considered effects, linearised at the fit.
 
-    With the products of their rows for noise of size `noise` [sigma given]; the samples have their
-    weights in the fit. With more, waves of wobble and the scale of a device that lengths have are
-    columns too. `rounding` are standard deviations of parameters that rounded joint values move
-    too.
+    Offsets from the nominal chain are normal about zero. The samples have their weights in the
+    fit, and noise of size `noise` [sigma given]. `rounding` are standard deviations of parameters
+    that rounded joint values move too. Plausible sizes and the device only count if `judging`.
+    """
+    columns = _Columns(fitted, noise, more, rounding)
+    evidence, arm, sums = columns.evidence(), columns.arm, columns.sums
+    size, slope = evidence.most_probable(columns.considered)
+    near = evidence.near(size, slope) if judging else []
+    usual = zip(columns.names, evidence.precision(size).tolist(), strict=False)
+    priors = {name: float(each**-0.5) for name, each in usual if each > 0.0}
+    if judging:
+        evidence.widen(size)
+    weights, tried = zip(*(near or [(1.0, size)]), strict=True)
+    alone, along = columns.about_nominal(sums.plain)
+    precisions = [evidence.precision(each)[arm] for each in tried]
+    each_alone = [solved(alone[arm, arm], along[arm], each) for each in precisions]
+    mean, covariance = mixed(each_alone, weights)
+    other = alone, sums.cross[:-1], sums.doubtful, evidence.precision(size), arm.stop
+    device = _device(*other) if judging else np.zeros((arm.stop, 0))
+    offsets = columns.offsets[arm]
+    found = offsets, mean - offsets, covariance, device, priors, evidence.named(size)
+    posterior = Posterior(columns.chain, columns.names, *found)
+    return posterior if fitted.held is None else posterior.held_at(*fitted.held)
+
+
+def with_doubts(
+    posterior: Posterior,
+    fitted: Fitted,
+    noise: float,
+    more: Sequence[str],
+    rounding: Mapping[str, float] | None = None,
+) -> Posterior:
+    """Return the posterior of the same arguments with the arms that may have given the data.
+
+    Its axes may wobble by the `unmodelled` waves, and the device may be out of scale.
+    """
+    columns = _Columns(fitted, noise, more, rounding, posterior.unmodelled.waves)
+    evidence, arm, considered = columns.evidence(), columns.arm, columns.considered
+    size, slope = evidence.most_probable(considered)
+    matrix, vector = columns.about_nominal(columns.sums.reduced)
+    near = evidence.near(size, slope)
+    rival, scale, checked = None, 0.0, bool(fitted.problem.sigma_scale)
+    if columns.scaled and fitted.held is None and (checked or columns.scale < PRINTED):
+        elsewhere = columns.evidence(max(OUT_OF_SCALE, columns.scale))
+        odds, mean, covariance = elsewhere.against(evidence, size, considered)
+        # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
+        odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
+        rival, scale = (odds, mean[arm], covariance[arm, arm]), float(mean[-1])
+    evidence.widen(size)
+    found = [(w, *solved(matrix, vector, evidence.precision(each))) for w, each in near]
+    doubted = [(w, mean[arm], root[arm] @ root[arm].T) for w, mean, root in found]
+    if fitted.held is not None:  # nothing measures the scale
+        doubted = [posterior.with_held(each, *fitted.held) for each in doubted]
+    elif columns.scaled and rival is None:
+        scale = float(found[0][1][-1])
+    return replace(posterior, doubted=tuple(doubted), rival=rival, scale=scale)
+
+
+class _Columns:
+    """Columns of the arm, then of its waves, then of the scale of a device that lengths have.
+
+    With the products of their rows for noise of a size.
     """
 
     def __init__(
         self,
         fitted: Fitted,
         noise: float,
-        more: Sequence[str] = (),
-        rounding: Mapping[str, float] | None = None,
+        more: Sequence[str],
+        rounding: Mapping[str, float] | None,
+        waves: float = 0.0,
     ) -> None:
         problem, names, system = fitted.problem, fitted.names, fitted.system
         own = [n for n in more if not (Parameter(n).of_dh or problem.model.owns_frame(n))]
         self.names, self.chain = (*names, *more), fitted.chain.with_effects(own)
         beside = {name: std for name, std in (rounding or {}).items() if name in names}
-        whole, lengths, self._scale = self.chain, dict[str, float](), SCALE
+        whole, lengths, self.scale = self.chain, dict[str, float](), SCALE
         if more:
-            whole, lengths, self._scale = lengths_of(self.chain, system)
-        waves = Unmodelled(waves=float(bool(more)))  # of 1 rad
-        doubts = Doubts(beside, lengths, bool(more), waves, kept=True)
+            whole, lengths, self.scale = lengths_of(self.chain, system)
+        doubts = Doubts(beside, lengths, bool(more), Unmodelled(waves=waves), kept=True)
         noise = max(noise, ROUNDING)  # parameters that follow all exactly leave none
-        self._sums = _sums_of(fitted, whole, self.names, doubts, noise)
-        self._reduced, count = self._sums.reduced, len(self._sums.plain) - 1
-        self._scaled, self._held, self._arm = bool(lengths), fitted.held, len(self.names)
-        every = np.arange(count)
-        self._waves = every[self._arm : count - self._scaled]
-        self._others = np.delete(every, self._waves)
-        self._offsets = np.append(fitted.offsets, np.zeros(count - len(names)))
-        self._checked = problem.sigma_scale
+        self.sums = _sums_of(fitted, whole, self.names, doubts, noise)
+        self.scaled, count = bool(lengths), len(self.sums.plain) - 1
+        self.arm = slice(0, count - self.scaled)  # with waves, in units of their size
+        self.offsets = np.append(fitted.offsets, np.zeros(count - len(names)))
         self._known: dict[str, float] = {**problem.given} | {**lenses(problem.model)}
+        self._checked = problem.sigma_scale
         free = {size_group(self.chain, name) for name in names if name not in self._known}
-        self._considered = {size_group(self.chain, name) for name in more} - free
+        self.considered = {size_group(self.chain, name) for name in more} - free
 
-    def posterior(self, judging: bool = True) -> Posterior:
-        """Return the posterior without waves; offsets from nominal are normal about zero.
-
-        Plausible sizes and the device only count if `judging`.
-        """
-        arm = slice(0, self._arm)
-        evidence = self._evidence(self._without(0.0)[0], self._checked)
-        size, slope = evidence.most_probable(self._considered)
-        near = evidence.near(size, slope) if judging else []
-        usual = zip(self.names, evidence.precision(size).tolist(), strict=False)
-        priors = {name: float(each**-0.5) for name, each in usual if each > 0.0}
-        if judging:
-            evidence.widen(size)
-        weights, tried = zip(*(near or [(1.0, size)]), strict=True)
-        alone, along = self._about_nominal(self._sums.plain)
-        precisions = [evidence.precision(each)[arm] for each in tried]
-        each_alone = [solved(alone[arm, arm], along[arm], each) for each in precisions]
-        mean, covariance = mixed(each_alone, weights)
-        device, others = np.zeros((self._arm, 0)), self._others
-        if judging:
-            products = alone[np.ix_(others, others)], self._sums.cross[others]
-            precision = evidence.precision(size)
-            device = _device(*products, self._sums.doubtful, precision, self._arm)
-        offsets = self._offsets[arm]
-        found = offsets, mean - offsets, covariance, device, priors, evidence.named(size)
-        posterior = Posterior(self.chain, self.names, *found)
-        return posterior if self._held is None else posterior.held_at(*self._held)
-
-    def with_doubts(self, posterior: Posterior, sigma_scale: float = 0.0) -> Posterior:
-        """Return that posterior with the arms that may have given the data.
-
-        Its axes may wobble by the `unmodelled` waves, and the device may be out of scale, also if
-        it was checked to the `sigma_scale` here or of the problem.
-        """
-        checked = sigma_scale or self._checked
-        normal, follow = self._without(posterior.unmodelled.waves)
-        evidence, considered = self._evidence(normal, checked), self._considered
-        size, slope = evidence.most_probable(considered)
-        near = evidence.near(size, slope)
-        rival, scale = None, 0.0
-        if self._scaled and self._held is None and (checked or self._scale < PRINTED):
-            elsewhere = self._evidence(normal, 0.0, max(OUT_OF_SCALE, self._scale))
-            odds, mean, covariance = elsewhere.against(evidence, size, considered)
-            # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
-            odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
-            rival = (odds, *self._followed(follow, mean, covariance))
-            scale = float(mean[-1])
-        evidence.widen(size)
-        found = [(w, *solved(*normal, evidence.precision(each))) for w, each in near]
-        doubted = [(w, *self._followed(follow, m, r @ r.T)) for w, m, r in found]
-        if self._held is not None:  # nothing measures the scale
-            doubted = [posterior.with_held(each, *self._held) for each in doubted]
-        elif self._scaled and rival is None:
-            scale = float(found[0][1][-1])
-        return replace(posterior, doubted=tuple(doubted), rival=rival, scale=scale)
-
-    def _evidence(self, normal: _Equations, checked: float, usual: float = 0.0) -> Evidence:
-        """Return the evidence; with another `usual` scale of the device, if any."""
-        typical = TYPICAL | {'scale': usual or self._scale}
+    def evidence(self, scale: float | None = None) -> Evidence:
+        """Return the evidence; with another usual `scale` of the device that nobody checked."""
+        typical = TYPICAL | {'scale': self.scale if scale is None else scale}
         groups = [None if n in self._known else size_group(self.chain, n) for n in self.names]
         given = [self._known.get(name, np.inf) for name in self.names]
-        if self._scaled:
+        waves = self.arm.stop - len(groups)
+        groups, given = [*groups, *[None] * waves], [*given, *[1.0] * waves]
+        if self.scaled:
+            checked = scale is None and self._checked
             groups, given = [*groups, None if checked else 'scale'], [*given, checked or np.inf]
+        normal = self.about_nominal(self.sums.reduced)
         return Evidence(*normal, np.array(given) ** -2.0, groups, typical)
 
-    def _about_nominal(self, products: FloatArray) -> _Equations:
+    def about_nominal(self, products: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the normal equations (K, K), (K,) of all offsets from products of their rows."""
         matrix = products[:-1, :-1]
-        return matrix, matrix @ self._offsets + products[:-1, -1]
-
-    def _without(self, size: float) -> tuple[_Equations, _Follow]:
-        """Return the normal equations without T waves of a size [rad], and how these follow."""
-        matrix, vector = self._about_nominal(self._reduced)
-        waves, others = self._waves, self._others
-        along = size * matrix[np.ix_(waves, others)]
-        known = np.eye(len(waves)) + size**2 * matrix[np.ix_(waves, waves)]
-        own = np.asarray(np.linalg.inv(known))
-        slopes, mean = own @ along, own @ (size * vector[waves])
-        normal = matrix[np.ix_(others, others)] - along.T @ slopes, vector[others] - along.T @ mean
-        return normal, (slopes, mean, own)
-
-    def _followed(
-        self, follow: _Follow, mean: FloatArray, covariance: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return mean and covariance of the arm, then of waves in units of their size."""
-        slopes, waves, own = follow
-        every = np.concatenate([np.eye(len(mean))[: self._arm], -slopes])
-        found = every @ covariance @ every.T
-        found[self._arm :, self._arm :] += own
-        return every @ mean + np.pad(waves, (self._arm, 0)), found
+        return matrix, matrix @ self.offsets + products[:-1, -1]
 
 
 def _sums_of(

@@ -30,7 +30,7 @@ from calib_ros.errors import InputError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.considered import considered
-from calib_ros.estimation.evidence import Linearised, Posterior
+from calib_ros.estimation.evidence import Posterior, posterior_of, with_doubts
 from calib_ros.estimation.fitted import Fitted, ParameterRow, Simpler, parameter_rows
 from calib_ros.estimation.fitting import SOME, fit
 from calib_ros.estimation.leastsquares import System, minimise, normal_equations
@@ -87,13 +87,12 @@ def _identified(
     share = lacking(fitted)
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
     more = considered(chain, names, problem.fixed)
-    linearised = Linearised(fitted, size, more, doubts)
-    posterior = linearised.posterior()
+    posterior = posterior_of(fitted, size, more, doubts)
     unmodelled, moved = unmodelled_errors(posterior, fitted.factor, fitted.system)
-    posterior = linearised.with_doubts(replace(posterior, unmodelled=unmodelled))
+    posterior = with_doubts(replace(posterior, unmodelled=unmodelled), fitted, size, more, doubts)
     uncertainty = fitted.uncertainty.with_part(moved).with_part(unmodelled.square)
     parameters = parameter_rows(fitted, structural, uncertainty)
-    region, scaled = _region(fitted, posterior, linearised)
+    region, scaled = _region(fitted, posterior, size, more, doubts)
     step = find_step(fitted)
     result = Identification(
         chain=chain,
@@ -131,14 +130,23 @@ def _identified(
 
 
 def _region(
-    fitted: Fitted, posterior: Posterior, linearised: Linearised
+    fitted: Fitted,
+    posterior: Posterior,
+    size: float,
+    more: Sequence[str],
+    doubts: Mapping[str, float],
 ) -> tuple[Region | None, float]:
-    """Return the region, and the error of the device's scale if that alone leaves none, or 0."""
+    """Return the region, and the error of the device's scale if that alone leaves none, or 0.
+
+    The posterior is that with `more` effects, `doubts` and noise of a `size`.
+    """
     sets, freedom = fitted.problem.sets, fitted.uncertainty.overall
     region = region_of(posterior, sets, freedom)
     if region is None and posterior.scale and not fitted.problem.sigma_scale:
-        checked = linearised.with_doubts(posterior, SCALE)
-        return None, posterior.scale if region_of(checked, sets, freedom) else 0.0
+        checked = replace(fitted, problem=replace(fitted.problem, sigma_scale=SCALE))
+        with_checked = with_doubts(posterior, checked, size, more, doubts)
+        if region_of(with_checked, sets, freedom) is not None:
+            return None, posterior.scale
     return region, 0.0
 
 

@@ -187,8 +187,7 @@ def test_the_risk_is_the_larger_of_poses_and_those_known_as_well(local, near, in
     """That by the scale of the device counts as far as a scale is likely, in log odds."""
     sets, sizes = [measured(arm(0), UR10E.random_joints(60, np.random.default_rng(0)))], []
     posterior = replace(local.posterior, rival=None)
-    _, mean, covariance = posterior.doubted[0]
-    rival = 0.5, np.full_like(mean, 7.0), covariance
+    rival = 0.5, np.full_like(posterior.offsets, 7.0), posterior.covariance
     harmful = [False]
 
     def risk(judge, which, around, doubts):

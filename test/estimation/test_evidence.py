@@ -251,4 +251,4 @@ def test_only_what_is_fitted_is_doubted(monkeypatch):
     names = ('base.x', 'elbow_joint.theta')
     fitted = SimpleNamespace(problem=problem, names=names, chain=UR10E, system=System(()))
     with pytest.raises(AskedError):
-        evidence.Linearised(fitted, 2.0, rounding=rounding)
+        evidence.posterior_of(fitted, 2.0, rounding=rounding)

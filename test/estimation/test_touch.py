@@ -14,7 +14,7 @@ from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.plausibility import _apart
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation import start
-from calib_ros.estimation.evidence import Linearised
+from calib_ros.estimation.evidence import posterior_of
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import System, triangular_factor
 from calib_ros.estimation.samples import Samples, residual_arrays
@@ -139,7 +139,7 @@ def test_what_planes_do_not_tell_is_held_and_uncertain(nominal, held):
     left = factor @ np.concatenate([slopes, np.eye(len(names))])
     alone = np.linalg.norm(factor[:, len(slopes) :], axis=0)
     assert (np.linalg.norm(left, axis=0) < 0.03 * alone).all()
-    stds = Linearised(fitted, fitted.size).posterior(judging=False).stds_of(names)
+    stds = posterior_of(fitted, fitted.size, judging=False).stds_of(names)
     shared = sum(std**2 * np.outer(s, s) for std, s in zip(stds, slopes.T, strict=True))
     np.testing.assert_allclose(fitted.uncertainty.parts[-1], shared, rtol=1e-9)
     assert fitted.uncertainty.freedom[-1] == np.inf
