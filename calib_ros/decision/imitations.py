@@ -60,11 +60,11 @@ class Imitation:
         """
         cross, vector = self._about_nominal(products)
         along = cross @ self._root
-        left = own / self._variance - along @ np.swapaxes(along, 1, 2)
-        left += MOVE**-2.0 * np.eye(own.shape[-1])
-        vector = vector - along @ self._fit
-        spared = np.linalg.solve(left, vector[..., np.newaxis])[..., 0]
-        return np.asarray(0.5 * np.einsum('bk,bk->b', vector, spared))
+        whole = own / self._variance + MOVE**-2.0 * np.eye(own.shape[-1])
+        left = whole - along @ np.swapaxes(along, 1, 2)
+        root = inverse_root(left, np.diagonal(whole, axis1=1, axis2=2))
+        spared = np.einsum('bkj,bk->bj', root, vector - along @ self._fit)
+        return np.asarray(0.5 * (spared**2).sum(axis=1))
 
     def against(self, products: FloatArray, own: FloatArray) -> tuple[float, FloatArray]:
         """Return the log odds of one move, and its size (K,); by products without B.
