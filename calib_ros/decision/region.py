@@ -182,10 +182,13 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
     return region
 
 
-def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float) -> Region | None:
+def region_of(
+    posterior: Posterior, sets: Sequence[Observations], freedom: float, largest: float
+) -> Region | None:
     """Return where a calibration may be used; None if not even at the measured poses.
 
-    `freedom` are the degrees of freedom of the noise estimate.
+    `freedom` are the degrees of freedom of the noise estimate; away from the measured poses the
+    expected error is `largest` [m] at most.
     """
     ends = sets[0].base, sets[0].tool
     measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
@@ -203,7 +206,7 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     doubts = judge.of_the_arm(posterior.doubted)
     if not max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts)) < RISK:
         return None
-    shells = order[~inside]
+    shells = order[~inside & (far[order] <= largest)]
     for shell in np.split(shells, range(SHELL, len(shells), SHELL)):
         added = judge.products(rows[..., shell])
         if not judge.risk(added, inner + added, doubts) < RISK:

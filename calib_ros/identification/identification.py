@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -140,12 +141,12 @@ def _region(
 
     The posterior is that with `more` effects, `doubts` and noise of a `size`.
     """
-    sets, freedom = fitted.problem.sets, fitted.uncertainty.overall
-    region = region_of(posterior, sets, freedom)
-    if region is None and posterior.scale and not fitted.problem.sigma_scale:
-        checked = replace(fitted, problem=replace(fitted.problem, sigma_scale=SCALE))
-        with_checked = with_doubts(posterior, checked, size, more, doubts)
-        if region_of(with_checked, sets, freedom) is not None:
+    problem, freedom = fitted.problem, fitted.uncertainty.overall
+    of = partial(region_of, sets=problem.sets, freedom=freedom, largest=problem.largest_error)
+    region = of(posterior)
+    if region is None and posterior.scale and not problem.sigma_scale:
+        checked = replace(fitted, problem=replace(problem, sigma_scale=SCALE))
+        if of(with_doubts(posterior, checked, size, more, doubts)) is not None:
             return None, posterior.scale
     return region, 0.0
 

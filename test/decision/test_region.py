@@ -196,11 +196,29 @@ def test_the_risk_is_the_larger_of_poses_and_those_known_as_well(local, near, in
         return found if harmful[0] or (doubts[1] == 7.0).all() else 0.0
 
     monkeypatch.setattr(region._Judge, 'risk', risk)
-    assert region_of(posterior, sets, np.inf).by_scale == 0.0
-    found = region_of(replace(posterior, rival=rival), sets, np.inf)
+    assert region_of(posterior, sets, np.inf, np.inf).by_scale == 0.0
+    found = region_of(replace(posterior, rival=rival), sets, np.inf, np.inf)
     assert found.by_scale == pytest.approx(0.3 / (1.0 + np.exp(-0.5)))
     harmful[0] = True
-    assert region_of(posterior, sets, np.inf) is None
+    assert region_of(posterior, sets, np.inf, np.inf) is None
+
+
+@pytest.mark.parametrize(('largest', 'covered'), [(0.01, False), (np.inf, True)])
+def test_no_pose_is_covered_with_an_expected_error_that_no_result_may_have(largest, covered):
+    """Play at two stations looked like errors of 50 mm, and metres were expected elsewhere."""
+    rng = np.random.default_rng(4)
+    stations = rng.uniform(-1.0, 1.0, 6) + np.cumsum(rng.uniform(-0.15, 0.15, (2, 6)), axis=0)
+    q = np.repeat(stations, 25, axis=0)[:40]
+    wrist = 0.17 * np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), axis=-1)
+    q[:, 4:] += np.tile(wrist.reshape(25, 2), (2, 1))[:40]
+    q += rng.normal(scale=3e-4, size=q.shape)
+    play = 3e-4 * rng.uniform(0.0, 1.0, 6)
+    turned = q + play * np.sign(np.diff(q, axis=0, prepend=q[:1] - rng.normal(size=(1, 6))))
+    seen = replace(measure(UR10E, turned, rng, 2e-5, oriented=False), joints=q)
+    found = identify(Problem(UR10E, seen, sigma_position=2e-5, largest_error=largest)).region
+    assert found.covers(q).all()
+    anywhere = UR10E.random_joints(500, rng)
+    assert (found.known(anywhere[found.covers(anywhere)]) > 0.01).any() is np.bool_(covered)
 
 
 def test_what_a_still_joint_leaves_open_is_not_covered(local):

@@ -34,7 +34,7 @@ def test_ellipsoids_are_those_of_f_or_of_its_limit(level, unsearched):
 def test_a_calibration_that_changes_nothing_may_be_used_nowhere(unsearched):
     seen = measured_arm(0, 30)[2]
     posterior = identify(Problem(UR10E, seen)).posterior
-    assert region_of(posterior, [seen], np.inf)
-    assert region_of(posterior, [seen], 2.0) is None  # with noise that is hardly known
+    assert region_of(posterior, [seen], np.inf, np.inf)
+    assert region_of(posterior, [seen], 2.0, np.inf) is None  # with noise that is hardly known
     none = replace(posterior, offsets=np.zeros_like(posterior.offsets))
-    assert region_of(none, [seen], np.inf) is None
+    assert region_of(none, [seen], np.inf, np.inf) is None
