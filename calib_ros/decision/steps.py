@@ -14,6 +14,7 @@ Products of all columns are summed from the end of the session and serve every s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -231,11 +232,21 @@ class _Scan:
             first, last = some[max(k - 1, 0)], some[min(k + 1, len(some) - 1)]
             first = max(first, LEAST_ASIDE)
             rows, own = self._moving(group, self._to_the_end(np.arange(first, last + 1)))
-            k = int(np.argmax(arm.gains(rows, own)))
+            gains = arm.gains(rows, own)
+            k = int(np.argmax(gains))
             odds, size = arm.against(rows[k], own[k])
+            if np.isfinite(odds) and first + k in self._torn():
+                odds = float(gains[k])
             if odds - trials > highest:
                 highest, found = odds - trials, _Found(group, int(first) + k, size, 1.0, 0.0)
         return found
+
+    def _torn(self) -> Sequence[int]:
+        """Return the ends of all gross errors if they follow each other: a side is torn off."""
+        numbers, weights = np.concatenate(self._numbers), np.concatenate(self._weights)
+        gross = np.setdiff1d(numbers, numbers[weights > 0.0])
+        alone = len(gross) >= LEAST_ASIDE and np.ptp(gross) < len(gross)
+        return (int(gross[0]), int(gross[-1]) + 1) if alone else ()
 
     def _moving(self, group: _Group, products: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return products (B, K, P + 1) of a frame's moves with the fit, and (B, K, K)."""
