@@ -123,8 +123,8 @@ def _lost(made: Columns) -> Flags:
 def without_statistics(columns: Columns) -> tuple[Columns, tuple[str, ...]]:
     """Return the rows that are not called mean and the like, and a note.
 
-    Others, such as max, hold poses, except beside a mean or at the end; so do means if most rows
-    are called so.
+    Others, such as max, hold poses, except beside a mean or at the end; so do means if they are
+    more than the rows of other names.
     """
     kept = np.ones(len(columns.lines), dtype=bool)
     for text in map(str, columns.cells.values()):  # as read: text of many rows
@@ -133,13 +133,13 @@ def without_statistics(columns: Columns) -> tuple[Columns, tuple[str, ...]]:
         cells = text.lower().split(BETWEEN)
         times, named = Counter(cells), [STATISTIC.match(cell) is not None for cell in cells]
         means = {k for k, cell in enumerate(cells) if MEAN.match(cell)}
-        few = 2 * len(means) <= len(cells)
+        few = len(means) <= max(1, named.count(False))
         for called, run in groupby(range(len(cells)), named.__getitem__):
             rows = [*run]
             last = rows[-1] == len(cells) - 1 and all(times[cells[k]] == 1 for k in rows)
-            if called and (last or (few and means & {*rows})):
+            if called and few and (last or means & {*rows}):
                 kept[rows] = False
     if kept.all():
         return columns, ()
     left = lines_in_words(columns.lines[~kept].tolist())
-    return columns.select(kept), (f'{columns.path}: statistics in {left}: skipped',)
+    return columns.select(kept), (f'statistics in {left}: skipped',)

@@ -87,7 +87,8 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
     if {*MATRIX} <= {*cells}:
         raise ColumnsError(f'{path} has rotation matrices: calib_ros import makes quaternions')
     notes = [f'{path}: the column {name} is read as {ours}' for name, ours in meant.items()]
-    notes += (*left, *skipped, *joints_left_out(path, found.header, joints))
+    notes += [f'{path}: {note}' for note in left]
+    notes += (*skipped, *joints_left_out(path, found.header, joints))
     if QUATERNION[0] not in cells:
         if {*TURNS} <= {*cells}:
             turns = ', '.join(TURNS)

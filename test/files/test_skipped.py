@@ -46,7 +46,7 @@ def test_statistics_below_a_table_are_no_poses(tmp_path, rows):
     path.write_text(NAMED + '\n'.join(rows) + '\n')
     for table in tables(path):
         assert_same(table, None)
-        assert any('statistics in line' in note for note in table.warnings)
+        assert any(note.startswith(f'{path}: statistics in line') for note in table.warnings)
 
 
 MANY = np.random.default_rng(7).normal(0.1, 0.8, (20, 5)).round(4)
@@ -107,7 +107,15 @@ def test_means_between_poses_are_no_poses(tmp_path, place):
             assert_same(table, None)
 
 
-@pytest.mark.parametrize('names', [('mean',) * 3, ('std', 'alt', 'alt'), ('average speed', 'p')])
+@pytest.mark.parametrize(
+    'names',
+    [
+        ('mean',) * 3,
+        ('std', 'alt', 'alt'),
+        ('average speed', 'p'),
+        ('P1 mean', 'P2 mean', 'P3 mean'),
+    ],
+)
 def test_poses_with_such_names_are_kept(tmp_path, names):
     path = tmp_path / 'cell.csv'
     path.write_text(NAMED.replace('\np,', '\n{},').format(*names, *'pp'))
