@@ -335,6 +335,8 @@ def _separator(path: Path, text: str) -> str:
         agreed = counts.count(usual) if usual > 1 else 0
         finer = agreed == len(lines) and usual > cells  # as if tabs are mixed with blanks
         below = [cell for row in rows[len(rows) // 2 :] for cell in row]  # the header
+        if name == 'bar' and 2 * sum(_is_number(cell, ',') for cell in below) <= len(below):
+            continue  # it is in names
         if agreed > 1.2 * most or (finer and all(_is_number(cell, '.') for cell in below)):
             best, most, cells = name, agreed, usual
     return best

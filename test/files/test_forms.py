@@ -28,6 +28,8 @@ FORMS = {
     'a table of Markdown': re.sub('(?m)^.+$', r'| \g<0> |', PLAIN.replace(',', ' | ')).replace(
         'z |', 'z |\n|--|--|--|--|--|'
     ),
+    'bars in names': re.sub('(?m)^(?=.)', 'left|top,', PLAIN),
+    'bars in names at the end': re.sub('(?m)(?<=.)$', ',left|7', PLAIN),
     'a unit behind a dash': PLAIN.replace('q1,q2,x', 'q1-rad,q2-rad,x'),
     'a date': 'Time;' + PLAIN.replace('\n', '\n2026-11-24 10:00:00;', 3).replace(',', ';'),
     'empty rows of a workbook': PLAIN + ',,,,\n' * 3,
