@@ -36,6 +36,7 @@ from calib_ros.files.vocabulary import (
     SHEETS,
     THOUSANDS,
     UNIT_SIGNS,
+    UNITS_ARE,
 )
 from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, read_bytes
@@ -154,7 +155,7 @@ def _sheet(
     first = _first(path, head, at, used, decimal, notes)
     if at < 0 and first:  # columns by their numbers
         header = tuple(f'#{k + 1}' for k in range(len(head[first][1])))
-    of_groups = [_over_groups(cells) for _, cells in head[max(at - 1, 0) : max(at, 0)]]
+    of_groups = [_over_groups(cells, len(header)) for _, cells in head[: max(at, 0)][-1:]]
     header = _with_units(header, [*(cells for _, cells in head[at + 1 : first]), *of_groups])
     above = ['\t'.join(cells) for _, cells in head[: first if at < 0 else at]]
     left: list[int] = []
@@ -242,10 +243,11 @@ def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tupl
     return header
 
 
-def _over_groups(cells: Sequence[str]) -> list[str]:
+def _over_groups(cells: Sequence[str], width: int) -> list[str]:
     """Return the line above a header, cells over blank ones too; empty without several units."""
     units = [UNIT_SIGNS.get(c.strip('[]() ').lower()) or name_and_unit(c)[1] for c in cells]
-    if sum(unit in UNIT_SIGNS for unit in units) < 2 or any(_is_number(c, ',') for c in cells):
+    told = UNITS_ARE.search('\t'.join(cells)) and len(cells) - cells.count('') < width  # in words
+    if told or sum(u in UNIT_SIGNS for u in units) < 2 or any(_is_number(c, ',') for c in cells):
         return []
     whole: Iterator[str] = accumulate(cells, lambda before, cell: cell or before)
     return [*whole]
@@ -328,8 +330,7 @@ def _separator(path: Path, text: str) -> str:
         raise InputError(f'{path} has no rows')
     best, most, cells = 'comma', 0, 1
     for name in ('tab', 'semicolon', 'bar', 'comma', 'space'):
-        mark = SEPARATORS[name]
-        rows = [line.split() if mark == ' ' else line.split(mark) for line in lines]
+        rows = [line.split(None if name == 'space' else SEPARATORS[name]) for line in lines]
         counts = [len(row) for row in rows]
         usual = max(set(counts), key=counts.count)
         agreed = counts.count(usual) if usual > 1 else 0

@@ -139,6 +139,7 @@ def test_a_linear_axis_has_its_own_unit_in_the_header(tmp_path):
         ('q1 in deg,q2 in deg,x in mm,y in millimetres,z in mm', '90,180,1,2,3'),
         ('Joints [deg],,Position [mm],,\nq1,q2,x,y,z', '90,180,1,2,3'),
         ('deg,deg,mm,mm,mm\nq1,q2,x,y,z', '90,180,1,2,3'),
+        ('Units,mm,deg\nq1,q2,x,y,z', '90,180,1,2,3'),
         ('Tool [mm],120,Angle [deg],,\nq1 [deg],q2,x [mm],y,z', '90,180,1,2,3'),
         ('Cell\na [deg],b,c [mm],d,e', '90,180,1,2,3'),
         ('Cell\na,b,c,d,e\ndeg,deg,mm,mm,mm', '90,180,1,2,3'),
