@@ -217,7 +217,9 @@ class _Table:
         """Refuse columns taken by our names if they may be nominal ones."""
         called = [self._sheet.called(named[n].names[0]) for n in POSITION if n in named]
         joints = len({*named} & {*joint_columns(MOST_NAMES)}) * ('q1' in named)
-        if doubt := in_doubt(self.names, [name_and_unit(name)[0] for name in called], joints):
+        theirs = {*self._chain.joint_names} - {*named} if self._chain else set[str]()
+        header = [name for name in self.names if name not in theirs]  # X of a gantry is its joint
+        if doubt := in_doubt(header, [name_and_unit(name)[0] for name in called], joints):
             raise InputError(f'{self.path}: {doubt}')
 
     def _complete(self, chain: Chain) -> None:

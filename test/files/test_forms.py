@@ -302,6 +302,18 @@ def test_a_column_is_not_a_joint_value_and_a_position(tmp_path, named):
         read_table(path, 3, foreign=Foreign(Layout(columns=named), arm))
 
 
+def test_the_joints_of_a_gantry_in_capitals_are_no_positions(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text('X,Y,Z,x,y,z\n1,2,3,4,5,6\n2,3,4,5,6,7\n')
+    arm = Chain('gantry', 'standard', tuple(Joint(name, 'prismatic') for name in 'XYZ'))
+    for found in (
+        read_table(path, 3, foreign=Foreign(Layout(), arm)),
+        loading.table(path, arm, Settings()),
+    ):
+        assert found.fitted[0].joints.tolist() == [[1, 2, 3], [2, 3, 4]]
+        assert found.fitted[0].positions.tolist() == [[4, 5, 6], [5, 6, 7]]
+
+
 def test_the_joints_with_motors_of_an_arm_whose_hand_is_kept_level_are_told(tmp_path):
     joints = [
         Joint(f'j{k}', a=0.5, lower=0 if k == 2 else None, upper=0 if k == 2 else None)
