@@ -42,6 +42,8 @@ OF_BAGS = tuple(
     if name not in ('sigma_scale', 'wanted_accuracy')
 )
 """Settings that affect the poses of a bag."""
+OF_REPORTS = ('operator', 'serial', 'device', 'conditions')
+"""Options for the report."""
 LAYOUT_OPTIONS = (
     *('length', 'angle', 'joint_angle', 'euler', 'quaternion', 'rotation_vector'),
     *('inverse', 'shift', 'separator', 'decimal', 'sheet'),

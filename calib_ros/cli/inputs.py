@@ -5,13 +5,12 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TypeAlias
 
+from calib_ros.cli import common
 from calib_ros.cli.common import LAYOUT_OPTIONS, OF_TABLES, Contents, sessions_of, settings_of
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
@@ -100,16 +99,8 @@ def origin_of(
     """Return the origin of a result: the options, and the files read."""
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
-    told = ('operator', 'serial', 'device', 'conditions')
-    people = {name: _as_utf8(getattr(options, name, '')) for name in told}
+    people = {name: getattr(options, name, '') for name in common.OF_REPORTS}
     return page.Origin(rows.inputs_of(*known), settings=settings, command=options.typed, **people)
-
-
-def _as_utf8(text: str) -> str:
-    """Return an argument that Python read in the locale (C, Latin-1) as the terminal wrote it."""
-    with suppress(UnicodeError):
-        return os.fsencode(text).decode()
-    return text
 
 
 def page_of(

@@ -20,6 +20,7 @@ import signal
 import sys
 import textwrap
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from itertools import groupby
 from typing import NoReturn
@@ -29,7 +30,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
 from calib_ros.cli.commands import COMMANDS, add_options
-from calib_ros.cli.common import refuse_alone
+from calib_ros.cli.common import OF_REPORTS, refuse_alone
 from calib_ros.cli.screen import Screen, fitted, help_width, wrapped
 from calib_ros.errors import CalibrationError, UnknownNameError, near, shortened, trouble
 
@@ -53,7 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))  # noqa: SIM115
     try:
         options = _options(given)
-        typed = shlex.join(('calib_ros', *given))
+        for told in {*OF_REPORTS} & {*vars(options)}:  # never paths: these are of the locale
+            setattr(options, told, _as_utf8(getattr(options, told)))
+        typed = shlex.join(('calib_ros', *map(_as_utf8, given)))
         options.typed = re.sub('://[^/@]*@', '://', typed)  # no password
         refuse_alone(options)
         module, function = options.home.split('.')
@@ -73,6 +76,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (CalibrationError, OSError) as err:
         return _failed(trouble(err))
     return status
+
+
+def _as_utf8(text: str) -> str:
+    """Return an argument that Python read in the locale (C, Latin-1) as the terminal wrote it."""
+    with suppress(UnicodeError):
+        return os.fsencode(text).decode()
+    return text
 
 
 def _failed(text: str, status: int = 1) -> int:

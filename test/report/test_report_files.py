@@ -36,10 +36,10 @@ def test_exported_files_carry_the_hash_of_the_table(solved):
 
 
 def test_identify_writes_what_it_was_told(table, run, tmp_path):
-    operator = 'Å. Smith'
-    in_bytes = operator.encode().decode('ascii', 'surrogateescape')  # as of a C locale
-    told = ('--operator', in_bytes, '--device', 'tracker 7', '--serial', '0012')
-    told += ('--conditions', '21 °C, 5 kg')
+    operator, serial = 'Å. Smith', 'Å 12'
+    told = ('--operator', operator, '--device', 'tracker 7', '--serial', serial)
+    told = [text.encode().decode('ascii', 'surrogateescape') for text in told]  # of a C locale
+    told += ('--conditions', '21 °C, 5 kg', '--history', 'history')
     status, said, _ = run(*IDENTIFY, *told, '--out', 'out', '--tolerance', 5, '--pdf')
     assert status == 0
     assert 'Accepted and within the tolerance of 5 mm RMS' in said
@@ -53,11 +53,13 @@ def test_identify_writes_what_it_was_told(table, run, tmp_path):
     written = (out / 'settings.yaml').read_text()
     assert yaml.safe_load(shown.replace('&#39;', "'")) == yaml.safe_load(written)
     digest = hashlib.sha256(table.read_bytes()).hexdigest()
-    for text in ('ur5e 0012', operator, 'tracker 7', '21 °C, 5 kg', digest, 'tolerance of 5 mm'):
+    told = (f'ur5e {serial}', operator, 'tracker 7', '21 °C, 5 kg', digest, 'tolerance of 5 mm')
+    for text in told:
         assert text in page.text
     assert page.data['explorer']['lines']
     document = json.loads((out / 'result.json').read_text())
     assert document['origin']['operator'] == operator
+    assert f"--operator '{operator}'" in document['origin']['command']
     assert document['origin']['inputs'][0]['sha256'] == digest
     assert document['tolerance_mm'] == 5.0
     shown = re.search('[0-9a-f]{64}', page.text)[0]
