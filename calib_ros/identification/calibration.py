@@ -171,7 +171,7 @@ class Calibration(Shown):
     def whose(self) -> str:
         """Return the robot and the date of the calibration, as far as known."""
         made, serial = (str(self.record.get(key) or '') for key in ('created', 'robot_serial'))
-        robot = f'{self.chain.name} {serial}' if serial else f'a {self.chain.name} (no serial)'
+        robot = f'{self.chain.name} {serial or "(no serial)"}'
         return f'the calibration of {robot}' + f', made {made[:10]}' * bool(made)
 
     def removed(self, joints: FloatArray) -> tuple[FloatArray, FloatArray]:

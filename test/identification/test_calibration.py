@@ -64,7 +64,7 @@ def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nomi
     assert again.pop('covariance').keys() == before.pop('covariance').keys()
     assert again == before
     assert read.whose == f'the calibration of ur10e 7, made {before["created"][:10]}'
-    assert replace(read, record={}).whose == 'the calibration of a ur10e (no serial)'
+    assert replace(read, record={}).whose == 'the calibration of ur10e (no serial)'
     q = UR.random_joints(200, np.random.default_rng(1))
     for ours, theirs in ((found, read), (replace(found, region=None), replace(read, region=None))):
         for ask in ('removed', 'sigma', 'remaining'):
