@@ -54,6 +54,8 @@ def _verified(
     sets, warnings, by_line = _sets(options, nominal, arm, screen)
     commanded = read_joints(options.commanded, nominal) if options.commanded else None
     tolerance = None if options.tolerance is None else 1e-3 * options.tolerance
+    if tolerance is not None and not 0.0 < tolerance <= 0.1:
+        raise InputError(f'--tolerance must be between 0 and 100 mm, not {options.tolerance:g} mm')
     confidence, moved = options.confidence, (options.new_base, options.new_tool)
     with screen.work('judging') as work:
         found = verify(arm, sets, tolerance, confidence, moved[0], commanded, moved[1], work)

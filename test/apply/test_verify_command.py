@@ -51,6 +51,9 @@ def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, run):
             assert 'judges the calibration' not in out
             assert '15 times at 5 poses' in out
             assert len([line for line in out.splitlines() if line[:6].strip().isdigit()]) == 5
+        status, _, err = run(*judge, '--tolerance', 300)
+        assert status == 1
+        assert '--tolerance must be between 0 and 100 mm, not 300 mm' in err
     status, out, _ = run(*VERIFY, 'result', '--commanded', 'corrected.csv', '--tolerance', 1)
     assert status == Status.NOT_ACCEPTED
     assert 'give the program as it was before calib_ros compensate' in ' '.join(out.split())
