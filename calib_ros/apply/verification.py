@@ -251,7 +251,9 @@ def _mistake(
     if error <= Settings.largest_error and angle <= Settings.largest_angle:
         return None
     problem = Problem(arm.before, sets[0], more=sets[1:])
-    return mistakes.explained(problem, far=True) or mistakes.explained_alone(problem, arm.chain)
+    found = mistakes.explained(problem, far=True) or mistakes.explained_alone(problem, arm.chain)
+    known = error > Settings.largest_error or (found and found.alone)  # else positions fit
+    return found if known else None
 
 
 def _rms(moments: FloatArray, lost: int) -> float:

@@ -247,7 +247,8 @@ def test_orientations_that_are_far_off_are_told(arm):
     """Positions alone are judged; but a mistake in the table is none of the arm."""
     seen = with_errors(arm, np.random.default_rng(0).normal(scale=1e-5, size=(8, 3)))
     turned = replace(seen, rotations=seen.rotations @ np.diag([1.0, -1.0, -1.0]))  # the target
-    for each, told in ((seen, False), (turned, True)):
+    none = replace(seen, rotations=np.tile(np.eye(3), (8, 1, 1)))  # as some drivers publish
+    for each, told in ((seen, False), (turned, True), (none, True)):
         found = verify(arm, [each], None)
         assert found.verdict == 'holds'
         assert ('only positions are judged' in in_words(found)) is told
