@@ -316,9 +316,7 @@ def _rows(path: Path, sheet: Any) -> list[Cells]:
 def _cell(value: object) -> str:
     if value is None:
         return ''
-    if isinstance(value, bool):
-        return str(int(value))
-    text = repr(value) if isinstance(value, float) else str(value)
+    text = str(int(value) if isinstance(value, bool) else value)
     return ' '.join(text.split())
 
 
@@ -336,8 +334,9 @@ def _separator(path: Path, text: str) -> str:
         agreed = counts.count(usual) if usual > 1 else 0
         finer = agreed == len(lines) and usual > cells  # as if tabs are mixed with blanks
         below = [cell for row in rows[len(rows) // 2 :] for cell in row]  # the header
-        if name == 'bar' and 2 * sum(_is_number(cell, ',') for cell in below) <= len(below):
-            continue  # it is in names
+        told = [_is_number(cell, ',') for cell in below if cell.strip()]
+        if name == 'bar' and 2 * sum(told) <= len(told):  # it is in names
+            continue
         if agreed > 1.2 * most or (finer and all(_is_number(cell, '.') for cell in below)):
             best, most, cells = name, agreed, usual
     return best

@@ -25,6 +25,7 @@ FORMS = {
     'a header of numpy with blanks': '# two joints\n# ' + PLAIN.replace(',', ' '),
     'a header of SpatialAnalyzer': '//' + PLAIN,
     'bars': PLAIN.replace(',', '|'),
+    'names between bars': re.sub('(?m)^.+$', r'|a|b|c|\g<0>|', PLAIN.replace(',', '|')),
     'a table of Markdown': re.sub('(?m)^.+$', r'| \g<0> |', PLAIN.replace(',', ' | ')).replace(
         'z |', 'z |\n|--|--|--|--|--|'
     ),
