@@ -24,7 +24,8 @@ _MEAN = (
 )
 _OTHERS = (
     r'median|max|maximum|min|minimum|range|spannweite|sum|total|summe|gesamt|count|anzahl'
-    r'|rms( error)?|st(andar)?d?[. -]*(dev(iation)?|err(or)?|abw(eichung)?)|std|sd|([1-6] ?)?sigma'
+    r'|rms( error)?|([1-6] ?)?sigma'
+    r'|(\w+[ _-])?(st(andar)?d?[. -]*(dev(iation)?|err(or)?|abw(eichung)?)|std|sd)'
     r'|var(iance)?|varianz|[ée]cart[- ]type|standardabweichung|標準偏差|标准差|tolerance|toleranz'
 )
 MEAN, STATISTIC = (
@@ -137,8 +138,8 @@ def without_statistics(columns: Columns) -> tuple[Columns, tuple[str, ...]]:
         for called, run in groupby(range(len(cells)), named.__getitem__):
             rows = [*run]
             last = rows[-1] == len(cells) - 1 and all(times[cells[k]] == 1 for k in rows)
-            if called and few and (last or means & {*rows}):
-                kept[rows] = False
+            if called and (last or means & {*rows}):
+                kept[[k for k in rows if few or k not in means]] = False
     if kept.all():
         return columns, ()
     left = lines_in_words(columns.lines[~kept].tolist())

@@ -123,6 +123,15 @@ def test_poses_with_such_names_are_kept(tmp_path, names):
         assert_same(table, None)
 
 
+def test_poses_may_be_means_with_their_deviations(tmp_path):
+    path = tmp_path / 'cell.csv'
+    head, *poses = NAMED.splitlines()
+    rows = [f'P{k} mean{each[1:]}\nP{k} std,0,0,1,2,3' for k, each in enumerate(poses)]
+    path.write_text('\n'.join([head, *rows]) + '\n')
+    for table in tables(path):
+        assert_same(table, None)
+
+
 @pytest.mark.parametrize('count', [1, 3])
 def test_a_name_that_comes_again_or_before_others_is_no_statistic(tmp_path, count):
     path = tmp_path / 'cell.csv'
