@@ -142,8 +142,8 @@ class Archive:
         named = text.partition('\n')[0].removeprefix('# ')
         if named.startswith('joints: ') and named != self._named:
             raise InputError(
-                f'{newest} has {named}; the chain has {self._named}: give them in that order, '
-                'or start without resume'
+                f'{newest} has {named}; the chain has {self._named}: resume it with a chain of '
+                'its joints in its order, or start without resume'
             )
         try:
             samples, warnings = read_journal(self._path, self._joints)
