@@ -80,6 +80,12 @@ DESIGNS = (
         Design(f'{what} moved, {size} mm', 72, ORDERS, what=what, size=1e-3 * size)
         for what, size in (('tool', 0.3), ('tool', 1), ('tool', 4), ('base', 1), ('base', 4))
     ),
+    Design(
+        *('base moved in succession', 100, ('succession',), ('none', 'small', 'usual')),
+        what='base',
+        size=1e-3,
+        counts=(40, 60, 80, 120),
+    ),
     *(
         Design(f'slip of {size} degrees', 72, ORDERS, what='slip', size=size * np.pi / 180.0)
         for size in (0.02, 0.1, 0.5)
