@@ -55,7 +55,8 @@ def find_step(fitted: Fitted, held: bool = False) -> Step | None:
     if found is not None:
         return None if scan.drifts(found) else scan.described(found)
     found = plain.imitated(fitted)
-    return None if found is None else plain.described(found)
+    step = None if found is None else plain.described(found)
+    return step if step is not None and step.harmful else None  # else nothing was imitated
 
 
 def _searched(fitted: Fitted, loaded: bool, gross: bool = True) -> tuple[_Scan, _Found | None]:
