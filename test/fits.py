@@ -111,3 +111,12 @@ def spoiled(seen, rng, share, shift=(0.0, 0.0), turn=(0.0, 0.0)):
     turns = se3.exp_rotation(directions(count, rng) * rng.uniform(*turn, (count, 1)))
     rotations[index] = turns @ rotations[index]
     return replace(seen, positions=positions, rotations=rotations), set(index.tolist())
+
+
+def at_stations(rng, count):
+    """Return joint values (25 count, 6): at each station the last two joints move on a grid."""
+    stations = rng.uniform(-1.0, 1.0, 6) + np.cumsum(rng.uniform(-0.15, 0.15, (count, 6)), axis=0)
+    q = np.repeat(stations, 25, axis=0)
+    wrist = 0.17 * np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), axis=-1)
+    q[:, 4:] += np.tile(wrist.reshape(25, 2), (count, 1))
+    return q + rng.normal(scale=3e-4, size=q.shape)

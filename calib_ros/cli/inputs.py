@@ -10,8 +10,14 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TypeAlias
 
-from calib_ros.cli import common
-from calib_ros.cli.common import LAYOUT_OPTIONS, OF_TABLES, Contents, sessions_of, settings_of
+from calib_ros.cli.common import (
+    LAYOUT_OPTIONS,
+    OF_REPORTS,
+    OF_TABLES,
+    Contents,
+    sessions_of,
+    settings_of,
+)
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -99,7 +105,7 @@ def origin_of(
     """Return the origin of a result: the options, and the files read."""
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
-    people = {name: getattr(options, name, '') for name in common.OF_REPORTS}
+    people = {name: getattr(options, name, '') for name in OF_REPORTS}
     return page.Origin(rows.inputs_of(*known), settings=settings, command=options.typed, **people)
 
 

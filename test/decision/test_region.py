@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 from commanded import missed
-from fits import UR10E, arm, rms
+from fits import UR10E, arm, at_stations, rms
 
 from calib_ros import Calibration, Compensator, Problem, compensate, identify, load_calibration
 from calib_ros.apply.simulation import Cell, faulty, measure
@@ -206,12 +206,8 @@ def test_the_risk_is_the_larger_of_poses_and_those_known_as_well(local, near, in
 @pytest.mark.parametrize(('largest', 'covered'), [(0.01, False), (np.inf, True)])
 def test_no_pose_is_covered_with_an_expected_error_that_no_result_may_have(largest, covered):
     """Play at two stations looked like errors of 50 mm, and metres were expected elsewhere."""
-    rng = np.random.default_rng(4)
-    stations = rng.uniform(-1.0, 1.0, 6) + np.cumsum(rng.uniform(-0.15, 0.15, (2, 6)), axis=0)
-    q = np.repeat(stations, 25, axis=0)[:40]
-    wrist = 0.17 * np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), axis=-1)
-    q[:, 4:] += np.tile(wrist.reshape(25, 2), (2, 1))[:40]
-    q += rng.normal(scale=3e-4, size=q.shape)
+    rng = np.random.default_rng(26)
+    q = at_stations(rng, 2)[:40]
     play = 3e-4 * rng.uniform(0.0, 1.0, 6)
     turned = q + play * np.sign(np.diff(q, axis=0, prepend=q[:1] - rng.normal(size=(1, 6))))
     seen = replace(measure(UR10E, turned, rng, 2e-5, oriented=False), joints=q)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import fits
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, along_path
+from fits import NOISE, SIGMAS, UR10E, along_path, at_stations
 
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -124,11 +124,7 @@ def test_a_move_that_the_arm_imitates_is_named(seed, at):
     """
     rng = np.random.default_rng(seed)
     true = arm(rng)
-    stations = rng.uniform(-1.0, 1.0, 6) + np.cumsum(rng.uniform(-0.15, 0.15, (3, 6)), axis=0)
-    q = np.repeat(stations, 25, axis=0)
-    wrist = 0.17 * np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), axis=-1)
-    q[:, 4:] += np.tile(wrist.reshape(25, 2), (3, 1))
-    q += rng.normal(scale=3e-4, size=q.shape)
+    q = at_stations(rng, 3)
     seen = measure(true, q, rng, *NOISE)
     assert identify(Problem(UR10E, seen, **SIGMAS)).accepted
     result = identify(Problem(UR10E, moved(seen, true, 'base', 1e-3, at=at), **SIGMAS))
