@@ -207,8 +207,7 @@ def test_the_risk_is_the_larger_of_poses_and_those_known_as_well(local, near, in
 def test_no_pose_is_covered_with_an_expected_error_that_no_result_may_have(largest, covered):
     """Play at two stations looked like errors of 50 mm, and metres were expected elsewhere."""
     rng = np.random.default_rng(26)
-    q = at_stations(rng, 2)[:40]
-    play = 3e-4 * rng.uniform(0.0, 1.0, 6)
+    q, play = at_stations(rng, 2)[:40], 3e-4 * rng.uniform(0.0, 1.0, 6)
     turned = q + play * np.sign(np.diff(q, axis=0, prepend=q[:1] - rng.normal(size=(1, 6))))
     seen = replace(measure(UR10E, turned, rng, 2e-5, oriented=False), joints=q)
     found = identify(Problem(UR10E, seen, sigma_position=2e-5, largest_error=largest)).region
