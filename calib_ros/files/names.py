@@ -42,12 +42,13 @@ NO_JOINT = _set(
 OTHER = NO_JOINT | _set('r s u v a f e n g normal twist angular angle euler rotvec omega gyro')
 """Other quantities that have coordinates, too."""
 NO_PLACE = NOMINAL_WORDS | DEVIATION | TURNED | OTHER
-EULER = {
-    ('roll', 'pitch', 'yaw'): (TURNS, 'xyz'),
-    ('a', 'b', 'c'): (IN_TURN, 'ZYX'),
-    ('w', 'p', 'r'): (TURNS, 'xyz'),
+ROTATIONS: dict[tuple[str, ...], tuple[tuple[str, ...], str]] = {
+    ('roll', 'pitch', 'yaw'): (TURNS, ' --euler xyz'),
+    ('a', 'b', 'c'): (IN_TURN, ' --euler ZYX'),
+    ('w', 'p', 'r'): (TURNS, ' --euler xyz'),
+    ('q 0', 'q 1', 'q 2', 'q 3'): (('qw', *QUATERNION[:3]), ''),
 }
-"""Names of three angles, with their meaning: about fixed axes, KUKA, Fanuc."""
+"""Words of names, with what they mean: about fixed axes, KUKA, Fanuc, Leica."""
 
 
 def words_of(name: str) -> list[str]:
@@ -143,12 +144,12 @@ def option(ours: Iterable[str], *theirs: Iterable[str]) -> str:
 
 
 def turns_in(path: Path, header: Sequence[str]) -> Iterator[str]:
-    """Yield how to use the angles of a header, by their names."""
-    words = {tuple(words_of(name)): name for name in header}
-    for angles, (ours, euler) in EULER.items():
-        found = [words.get((angle,), '') for angle in angles]
-        if all(found):
-            yield f'{path}: to use {", ".join(found)}, give {option(ours, found)} --euler {euler}'
+    """Yield how to use the angles or the quaternion of a header, by their names."""
+    names = {' '.join(words_of(name)): name for name in header}
+    for words, (ours, more) in ROTATIONS.items():
+        found = [names.get(each, '') for each in words]
+        if all(found) and not ('q 0' in words and 'q 4' in names):  # q0 to q5 are joints
+            yield f'{path}: to use {", ".join(found)}, give {option(ours, found)}{more}'
             return
 
 

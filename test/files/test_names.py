@@ -4,6 +4,7 @@
 
 import re
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from calib_ros.errors import ColumnsError, InputError
 from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, layout_of
+from calib_ros.files.names import turns_in
 from calib_ros.kinematics.chain import Joint
 
 ARM = Chain('arm', 'standard', (Joint('shoulder'), Joint('elbow')))
@@ -214,6 +216,27 @@ def test_the_option_for_angles_is_told(tmp_path, angles, option):
     assert_same(
         read(path, preset='', columns=[columns], given={'euler': euler, 'joint_angle': 'rad'})
     )
+
+
+def test_the_option_for_the_quaternion_of_a_leica_tracker_is_told(tmp_path):
+    """Its first number is the scalar; beside others, the column was not even named."""
+    path, log = tmp_path / 'points.csv', tmp_path / 'joints.csv'
+    numbers = TURNED.as_quat()[:, [3, 0, 1, 2]]
+    names = ['X  [m]', 'Y  [m]', 'Z  [m]', 'Q0 ', 'Q1 ', 'Q2 ', 'Q3 ']
+    path.write_text(text_of(PLACES, numbers, names=names))
+    log.write_text(text_of(JOINTS, names=['q1', 'q2']))
+    foreign = Foreign(Layout(), ARM, log)
+    found = loading.table(path, ARM, Settings(), foreign=foreign)
+    (note,) = (each for each in found.warnings if 'to use' in each)
+    assert note == f'{path}: to use Q0, Q1, Q2, Q3, give --columns "qw=Q0,qx=Q1,qy=Q2,qz=Q3"'
+    layout = layout_of('', re.search('--columns "(.*)"', note).groups(), {})
+    assert_same(loading.table(path, ARM, Settings(), foreign=replace(foreign, layout=layout)))
+
+
+def test_five_numbered_columns_are_no_quaternion(tmp_path):
+    numbered = [f'Q{k}' for k in range(5)]
+    assert not [*turns_in(tmp_path, numbered)]
+    assert [*turns_in(tmp_path, numbered[:4])]
 
 
 def test_numbers_as_names_of_columns_are_no_values(tmp_path):
