@@ -14,7 +14,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain, zip_longest
+from functools import cached_property
+from itertools import chain, islice, zip_longest
+from operator import length_hint
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +41,6 @@ from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 Cells = tuple[int, list[str]]  # line number and cells
 BETWEEN = '\0'
-MAYBE_MISSING = re.compile(f'{BETWEEN}( |({"|".join(map(re.escape, MISSING))}){BETWEEN})')
 Codes = tuple[Index, list[str]]
 """The code (N,) of each row's text, and the texts in order of appearance."""
 
@@ -95,8 +96,7 @@ class Columns:
         """Return numbers (N, len(names)), NaN for empty cells; errors name them as `called`."""
         found = np.zeros((len(self.lines), len(names)))
         for k, name in enumerate(names):
-            given = self.cells[name]
-            found[:, k] = _numbers(given, self.decimal) if isinstance(given, str) else given
+            found[:, k] = self._read(name)
         for row, k in np.argwhere(np.isinf(found))[:1].tolist():
             raise self._no_number(row, names[k], (called or names)[k])
         return found
@@ -143,12 +143,20 @@ class Columns:
 
     def blank(self, name: str) -> Flags:
         """Return (N,) which cells of a column are empty; all without the column."""
-        given = self.cells.get(name)
-        if not isinstance(given, str):
-            return np.ones(len(self.lines), bool) if given is None else np.isnan(given)
-        if not MAYBE_MISSING.search(f'{BETWEEN}{given.lower()}{BETWEEN}'):
-            return np.zeros(len(self.lines), dtype=bool)
-        return np.array([text.strip().lower() in MISSING for text in self.texts(name)], dtype=bool)
+        count = len(self.lines)
+        return np.isnan(self._read(name)) if name in self.cells else np.ones(count, dtype=bool)
+
+    def _read(self, name: str) -> FloatArray:
+        """Return numbers (N,), NaN for empty cells, infinity for others without one."""
+        given = self._known.get(name, self.cells[name])
+        if isinstance(given, str):
+            given = self._known[name] = _numbers(given, self.decimal)[: len(self.lines)]
+        return given
+
+    @cached_property
+    def _known(self) -> dict[str, FloatArray]:
+        """Numbers read so far: those of a measurement tell which rows have one."""
+        return {}
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column."""
@@ -268,36 +276,35 @@ def csv_blocks(
             'Save it as CSV in UTF-8'
         )
     as_text(data, str(path), ColumnsError)
-    lines = chain(csv_lines(data, str(path)), ['\n'])  # no row, unless a quotation mark is open
+    end = iter(['\n'])  # no row, unless a quotation mark is open
+    lines = chain(csv_lines(data, str(path)), end)
     reader = csv.reader(lines, delimiter=separator, strict=strict)
-    before = line = width = 0
-    block = list[Cells]()
+    line = width = 0
     try:
-        for row in reader:
-            before, line = line, reader.line_num
-            ends = '\r\n?|\n'  # of lines, as csv has them
-            within = re.split(ends, separator.join(row)) if line - before > 1 < width else ()
-            if {part.count(separator) for part in within} == {width - 1}:  # a note has others
-                line = before
-                raise csv.Error('whole rows are within quotation marks')
-            width = len(row) or width
-            if any(row):
-                block.append((above + line, row))
-            if len(block) * len(row) >= MOST_ENTRIES:  # cells that fit the caches
-                if len(row) > MOST_ENTRIES:
-                    raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
+        while length_hint(end):
+            before = line
+            some = islice(reader, MOST_ENTRIES // width + 1 if width else 1)  # fits the caches
+            block = [(above + line, row) for row in some if (line := reader.line_num) and any(row)]
+            widths = [width, *(len(row) for _, row in block)]
+            of_several = block if line - before > len(block) else []  # or with blank lines
+            for cells, (last, row) in zip(widths, of_several, strict=False):
+                within = re.split('\r\n?|\n', separator.join(row))  # lines, as csv has them
+                if len(within) > 1 < cells and {w.count(separator) for w in within} == {cells - 1}:
+                    line = last - above - len(within)
+                    raise csv.Error('whole rows are within quotation marks')
+            if max(widths) > MOST_ENTRIES:
+                raise InputError(f'{path} has {max(widths)} columns, more than {MOST_ENTRIES}')
+            if block and block[-1][0] == above + line and not length_hint(end):
+                line = block[-2][0] - above if len(block) > 1 else before
+                raise csv.Error('unexpected end of data')
+            if block:
+                width = widths[-1]
                 yield block
-                block = []
-        if row:
-            line = before
-            raise csv.Error('unexpected end of data')
     except csv.Error as err:
         raise (InputError if line else ColumnsError)(  # other separators may suit the header
             f'cannot read {path} from line {above + line + 1}: {err}: are its quotation marks '
             'paired?'
         ) from err
-    if block:
-        yield block
 
 
 def _numbers(text: str, decimal: str = '.') -> FloatArray:

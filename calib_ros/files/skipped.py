@@ -50,8 +50,6 @@ STATISTICS: tuple[Statistic, ...] = (
     lambda columns: np.full(columns.shape[1], len(columns)),
 )
 """Statistics that a table may have, a row each."""
-NO_TARGET = re.compile(r'\0\s*-?(?:0|9{4,})[.,]?0*\s*(?:\0|$)')
-"""A coordinate as devices write it without a target: 0 or -9999, all three alike."""
 
 
 def measured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
@@ -108,10 +106,7 @@ def _summarise(columns: FloatArray, rows: Flags) -> bool:
 
 def _lost(made: Columns) -> Flags:
     """Return (N,) which rows have 0, -9999 or the like for all of x, y, z."""
-    given = [made.cells.get(name) for name in POSITION]
-    if any(
-        x is None or (isinstance(x, str) and not NO_TARGET.search(f'{BETWEEN}{x}')) for x in given
-    ):
+    if not {*POSITION} <= {*made.cells}:
         return np.zeros(len(made.lines), dtype=bool)
     x, y, z = made.numbers(POSITION).T
     same = np.asarray((x == y) & (y == z))
