@@ -275,10 +275,10 @@ def hashes(sets: Sequence[Observations]) -> Hashes:
             measured = np.concatenate([each.pixels, each.points], axis=1)
         elif each.distances is not None:
             measured = each.distances[:, np.newaxis]
-        cells = np.round(np.concatenate([each.joints, measured], axis=1) / GRID)
         mixed = np.zeros(len(each), dtype=np.uint64)
-        for column in cells.astype(np.int64).view(np.uint64).T:  # Fibonacci hashing, folded
-            mixed = (mixed ^ column) * np.uint64(0x9E3779B97F4A7C15)
+        for column in (*each.joints.T, *measured.T):  # Fibonacci hashing, folded
+            cells = np.round(column / GRID).astype(np.int64).view(np.uint64)
+            mixed = (mixed ^ cells) * np.uint64(0x9E3779B97F4A7C15)
             mixed ^= mixed >> np.uint64(29)
         found.append(mixed)
     return np.concatenate(found)
@@ -297,7 +297,8 @@ class Fingerprint:
         """Return the fingerprint of rows and of those fitted earlier."""
         new = hashes(sets)
         if earlier is None:
-            return cls(len(new), np.unique(new)[:KEPT])
+            least, _ = np.unique(new, return_index=True)  # sorts, which is faster than hashing
+            return cls(len(new), least[:KEPT])
         both = np.union1d(earlier.least, earlier.comparable(new))[:KEPT]
         latest = np.concatenate([new, earlier.latest])[:KEPT]
         return cls(earlier.count + len(new), both, latest)

@@ -49,7 +49,7 @@ from calib_ros.kinematics.parameter import (
     parameters_of,
 )
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.kinematics.walk import Walk
+from calib_ros.kinematics.walk import BLOCK, Walk
 from calib_ros.shown import Shown
 from calib_ros.values import array_of
 
@@ -292,10 +292,14 @@ class Chain(Shown):
         `approach` (N, n) holds the signs of the preceding velocities, for backlash; `base` and
         `tool` select frames.
         """
-        rows = np.ascontiguousarray(self.joint_values(q).T)
-        signs = None if approach is None else np.ascontiguousarray(approach.T)
-        axes, origin = self.trace(rows, signs, base, tool)
-        return se3.transform(axes.transpose(2, 1, 0), origin.T)
+        q = self.joint_values(q)
+        found = np.empty((len(q), 4, 4))
+        for start in range(0, len(q), BLOCK):
+            part = slice(start, start + BLOCK)
+            signs = None if approach is None else np.ascontiguousarray(approach[part].T)
+            axes, origin = self.trace(np.ascontiguousarray(q[part].T), signs, base, tool)
+            found[part] = se3.transform(axes.transpose(2, 1, 0), origin.T)
+        return found
 
     def joint_values(self, q: FloatArray) -> FloatArray:
         """Return joint values (N, n) as an array; refuse any other shape."""
