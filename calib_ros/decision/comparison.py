@@ -63,10 +63,9 @@ class Residuals:
 
     def figures(self, which: Flags) -> ErrorFigures:
         """Return RMS, mean and maximum over the pairs of a mask (N,)."""
-        parts = self.position, self.orientation, self.pixels
-        distance, angle, away = (norms(part[which]) for part in parts)
-        distance, angle = 1e3 * distance, 1e3 * angle[~np.isnan(angle)]
-        away = away[~np.isnan(away)]
+        parts = self.orientation, self.pixels
+        angle, away = (norms(part[which & ~np.isnan(part[:, 0])]) for part in parts)
+        distance, angle = 1e3 * norms(self.position[which]), 1e3 * angle
         return ErrorFigures(
             len(distance),
             float(np.sqrt(np.mean(distance**2))),

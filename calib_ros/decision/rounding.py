@@ -54,9 +54,11 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
 def _step(values: FloatArray) -> float:
     few = values[:3, np.newaxis] / STEPS
     likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < ROUNDED, STEPS).tolist()
-    step = next((s for s in sorted(likely, reverse=True) if _are_multiples(values, s)), 0.0)
-    wider = step and _are_multiples(values, CLEARLY * step)
-    return 0.0 if wider or len(np.unique(values)) < 3 else step
+    for step in sorted(likely, reverse=True):
+        if _are_multiples(values, step):
+            wider = _are_multiples(values, CLEARLY * step)
+            return 0.0 if wider or len(np.unique(values)) < 3 else step
+    return 0.0
 
 
 def _are_multiples(values: FloatArray, step: float) -> bool:
@@ -70,7 +72,7 @@ def may_be_rounding(fitted: Fitted, before: Chain, steps: Mapping[str, float]) -
     """
     problem, names = fitted.problem, fitted.names
     pairs = zip(problem.sets, fitted.robust.good, strict=True)
-    sets = [each.select(which).spread() for each, which in pairs]
+    sets = [each.spread(good=good) for each, good in pairs]
     joints = np.concatenate([each.joints for each in sets])
     levels = {}
     for number, joint in enumerate(problem.chain.joints):

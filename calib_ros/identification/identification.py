@@ -179,7 +179,7 @@ def _chance(fitted: Fitted, before: Chain) -> float | None:
     if any(each.socket for each in problem.sets):
         return None
     pairs = zip(problem.sets, fitted.robust.good, strict=True)
-    sets = [each.select(np.flatnonzero(which)).spread(SOME) for each, which in pairs]
+    sets = [each.spread(SOME, good) for each, good in pairs]
     frames = [name for name in names if before.owns_frame(name)]
     arm = [name for name in names if not before.owns_frame(name)]
     return chance_of_gain(before, frames, arm, replace(problem, learned=None).system(sets))
