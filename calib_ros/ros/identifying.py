@@ -81,6 +81,7 @@ ANSWER_LENGTH = LONGEST // 2
 """Characters of an answer: a few terminal lines; the rest is in a file and the log."""
 KEEP = '; to keep it call ~/save'
 NOT_FILED = '; not filed'
+ONE_BEFORE = 'the last ~/identify has given no calibration, this is the one before it: '
 TELLING_RULES = {Rule.MISTAKE, Rule.ENCODER, Rule.DROPPED}
 """Rules whose advice says nothing without the refusal."""
 
@@ -122,6 +123,7 @@ class Identifying:
         self._residuals = node.create_publisher(MarkerArray, '~/residuals', to_ros.LATCHED)
         self.progress = Progress('identifying')
         self.last = 'nothing identified yet'  # result of the last identification or ~/load
+        self.earlier = ''  # what to say of the calibration in use, if it is not of the last one
         self.observability = ''
         self._advice = ''  # of the last identification, most serious first
         self._report: Path | None = None  # of the last identification, if it was refused
@@ -129,6 +131,7 @@ class Identifying:
     def snapshot(self, inputs: Inputs) -> Snapshot:
         """Return the current problem and its context."""
         session, self._advice, self._report = self._session, '', None
+        self.earlier = ONE_BEFORE
         try:
             problem = session.problem()
         except InputError as err:
@@ -178,6 +181,7 @@ class Identifying:
             found = Calibration.of(result, given.origin, loaded.owners, loaded.problem.sets)
             published = Published(found.dump(), given.configuration, page)
             self._accepted(found, published, given.samples)
+            self.earlier = ''
             self.last += KEEP
         else:
             if self._session.calibration is not None:
@@ -186,6 +190,11 @@ class Identifying:
         row = partial(identified, result)
         self.last += self._filer.file(lambda: loaded.problem, settings, row)
         return result.accepted, self.last
+
+    def loaded(self, which: str) -> Answer:
+        """Note which calibration is in use instead; return the answer."""
+        self.earlier, self.last = '', f'loaded {which}'
+        return True, self.last
 
     def _keep_report(self, page: Callable[[], str | None]) -> None:
         try:

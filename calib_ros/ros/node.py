@@ -129,13 +129,13 @@ class CalibrationNode(Batched):
             (SetBool, '~/record', self._on_record),
         ):
             self.create_service(kind, name, self._answering(name, callback))
-        identify = self._identifying
+        identify, keeper, whose = self._identifying, self._keeper, self._saying_whose
         slow: tuple[tuple[str, Callable[[], Any], Callable[[Any], Answer]], ...] = (
             ('~/identify', lambda: identify.snapshot(self._inputs), identify.run),
-            ('~/export', partial(self._settled, self._keeper.exportable), self._keeper.export),
-            ('~/save', partial(self._settled, self._keeper.to_save), self._keeper.save),
-            ('~/check', self.session.recent, self._on_check),
-            ('~/validate', self._to_judge, self._on_validate),
+            ('~/export', *whose(partial(self._settled, keeper.exportable), keeper.export)),
+            ('~/save', *whose(partial(self._settled, keeper.to_save), keeper.save)),
+            ('~/check', *whose(self.session.recent, self._on_check)),
+            ('~/validate', *whose(self._to_judge, self._on_validate)),
         )
         return {
             name: DeferredTrigger(self, name, self._answer, partial(self._up_to_now, begin), work)
@@ -258,6 +258,17 @@ class CalibrationNode(Batched):
             )
         return begin(*arguments)
 
+    def _saying_whose(
+        self, begin: Callable[[], Any], work: Callable[[Any], Answer]
+    ) -> tuple[Callable[[], Any], Callable[[Any], Answer]]:
+        """Return both steps of a service; it says first if it uses an earlier calibration."""
+
+        def told(given: tuple[str, Any]) -> Answer:
+            success, text = work(given[1])
+            return success, given[0] + text
+
+        return lambda: (self._identifying.earlier, begin()), told
+
     def _on_capture(self, request: Any) -> Answer:
         socket = self.get_parameter('socket').value
         count, why = self.session.capture(socket)
@@ -308,8 +319,7 @@ class CalibrationNode(Batched):
         return True, 'recording' if request.data else 'not recording: messages are not used'
 
     def _on_load(self, request: Any) -> Answer:
-        self._identifying.last = f'loaded {self._keeper.load()}'
-        return True, self._identifying.last
+        return self._identifying.loaded(self._keeper.load())
 
     # Topics out
 

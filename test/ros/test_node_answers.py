@@ -23,7 +23,7 @@ from calib_ros.files.history import History
 from calib_ros.identification.records import nominal_document
 from calib_ros.kinematics.chain_file import calibration_record, dump_chain, load_chain, parse_chain
 from calib_ros.report.advice import rules
-from calib_ros.ros.identifying import KEEP, NOT_FILED, _without_middle
+from calib_ros.ros.identifying import KEEP, NOT_FILED, ONE_BEFORE, _without_middle
 from calib_ros.ros.inputs import deserialised
 from calib_ros.sampling.batches import Stream, feed
 from calib_ros.sampling.hints import apart
@@ -395,3 +395,6 @@ def test_a_poor_identification_publishes_nothing_and_keeps_the_last(unsearched, 
     heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
     cell.spin_until(lambda: heard)
     assert len(texts) == 1
+    assert all(cell.call(k).message.startswith(ONE_BEFORE) for k in ('save', 'export', 'validate'))
+    cell.done('load')
+    assert ONE_BEFORE not in cell.done('save').message
