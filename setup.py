@@ -105,8 +105,8 @@ setup(
     zip_safe=True,
     entry_points={
         'console_scripts': [
-            'calib_ros = calib_ros.cli.main:main',
-            'calibration_node = calib_ros.ros.node:main',
+            'calib_ros = calib_ros.start:command_line',
+            'calibration_node = calib_ros.start:node',
         ]
     },
 )

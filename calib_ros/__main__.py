@@ -4,7 +4,7 @@
 
 import sys
 
-from calib_ros.cli.main import main
+from calib_ros.start import command_line
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(command_line())

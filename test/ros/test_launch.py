@@ -22,7 +22,7 @@ def test_what_is_not_given_is_not_passed(launched):
 
 
 def test_the_launch_file_names_what_is_there():
-    assert f'{NODE} = calib_ros.ros.node:main' in (ROOT / 'setup.py').read_text()
+    assert f'{NODE} = calib_ros.start:node' in (ROOT / 'setup.py').read_text()
     assert set(REMAPPED) <= {source.topic for source in STANDARD} | {'joint_states'}
 
 

@@ -1,0 +1,33 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Programs that are interrupted while they load."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+SLOW = """
+import importlib, time
+from calib_ros import start
+def slow(name):
+    print(name, flush=True)
+    time.sleep(600.0)
+importlib.import_module = slow
+"""
+
+
+@pytest.mark.parametrize(
+    ('program', 'module'), [('command_line', 'calib_ros.cli.main'), ('node', 'calib_ros.ros.node')]
+)
+def test_an_interruption_ends_it_in_silence(program, module):
+    """A traceback of numpy or rclpy was printed."""
+    given = [sys.executable, '-c', f'{SLOW}start.{program}()']
+    with subprocess.Popen(
+        given, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as child:
+        assert child.stdout.readline() == f'{module}\n'
+        child.send_signal(signal.SIGINT)
+        assert child.communicate() == ('', '')
+    assert child.returncode == -signal.SIGINT
