@@ -189,8 +189,8 @@ class DeferredTrigger:
         """Tell whether work runs."""
         return self._running.is_set()
 
-    def join(self, timeout: float) -> bool:
-        """Wait for the work [s]; return whether it has ended."""
+    def join(self, timeout: float | None) -> bool:
+        """Wait for the work [s], with None to its end; return whether it has ended."""
         if self._thread is not None:
             self._thread.join(timeout)
         return self._thread is None or not self._thread.is_alive()

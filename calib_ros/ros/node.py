@@ -57,6 +57,7 @@ TAKING_PERIOD = DIAGNOSTICS_PERIOD / 10.0
 """Time [s] between two batches of messages: taken one by one, each in a cold cache, they cost
 three times as much."""
 JOIN_TIMEOUT = DIAGNOSTICS_PERIOD  # time [s] for which the shutdown waits for running work
+WRITING = {'~/export', '~/save'}  # whose work is not cut off, since it writes files
 STATUS_LENGTH = 120  # characters of the status: `ros2 topic echo` cuts texts at 128
 
 
@@ -151,15 +152,20 @@ class CalibrationNode(Batched):
 
     def close(self) -> bool:
         """Stop; return False if an identification still runs and must not be waited for."""
-        running = [name for name, each in self._working.items() if not each.join(JOIN_TIMEOUT)]
-        for name in running:  # the caller hears no more
-            self.get_logger().warning(f'ended before the answer of {name}')
+        log, working = self.get_logger(), self._working
+        late = [name for name, each in working.items() if not each.join(JOIN_TIMEOUT)]
         helped = self._guide.join(JOIN_TIMEOUT)
         self._take_messages()
         self.session.finish()
         self.lost = self._archive.close()
         if self.lost:
-            self.get_logger().error(self.lost)
+            log.error(self.lost)
+        for name in {*late} & WRITING:
+            log.info(f'waiting for {name}')
+            working[name].join(None)
+        running = [name for name in late if not working[name].join(0.0)]
+        for name in running:  # the caller hears no more
+            log.warning(f'ended before the answer of {name}')
         self.destroy_node()
         return helped and not running
 

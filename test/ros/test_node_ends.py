@@ -143,6 +143,35 @@ def test_ended_while_an_identification_runs(journal):
         assert 'ended before the answer of ~/identify' in child.output
 
 
+SLOW_SAVE = """
+import time
+from calib_ros.report import page
+from calib_ros.ros import node
+node.JOIN_TIMEOUT = 0.1
+def slow(*given):
+    print('rendering', flush=True)
+    time.sleep(1.0)
+    return '<html>'
+page.render = slow
+"""
+
+
+def test_ended_while_a_calibration_is_saved(journal):
+    """Its report was missing, and its thread could end in the middle of a file."""
+    command = ('-c', SLOW_SAVE + NODE)
+    with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
+        cell.done('identify')
+        cell.start_call('save')
+        child.wait_for('rendering')
+        assert child.end(signal.SIGINT) == 0, child.output
+    (path,) = journal.glob('*Z.html')
+    said = f'~/save: saved to {path.with_suffix(".yaml")}, {path}'
+    assert said in child.output
+    assert 'waiting for ~/save' in child.output
+    assert 'ended before' not in child.output
+    assert not [each for each in journal.iterdir() if '.partial' in each.name]
+
+
 def test_ended_while_it_waits_for_the_robot(tmp_path):
     with Child(chain='robot_description', data_dir=tmp_path) as child:
         child.wait_for('waiting up to')
