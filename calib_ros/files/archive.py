@@ -7,7 +7,6 @@ Rows that cannot be written, as on a full disk, wait in memory.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -18,10 +17,16 @@ from urllib.parse import quote
 
 from calib_ros.atomic import short_name, whole_folder, write_file, write_files, write_together
 from calib_ros.errors import InputError, trouble
-from calib_ros.files.journal import Journal, read_journal
+from calib_ros.files.journal import (
+    Journal,
+    joints_line,
+    read_journal,
+    refuse_other_joints_than,
+    settings_beside,
+)
 from calib_ros.sampling.sample import Sample
 
-_CALIBRATION, _JOURNAL, _SETTINGS = '.yaml', '.csv', '.settings.yaml'
+_CALIBRATION, _JOURNAL = '.yaml', '.csv'
 
 
 class Archive:
@@ -45,7 +50,7 @@ class Archive:
         names = filter(None, (*robot.split('/', 1), tip))
         words = (re.sub(r'[^\w.-]', lambda m: quote(m[0], ''), name) for name in names)
         self._robot = short_name('+'.join(words))  # no two robots alike: + is escaped in words
-        self._joints, self._named = len(joints), f'joints: {json.dumps(joints)}'
+        self._joints = joints
         self._configuration = configuration
         self._journal: Journal | None = None
         self._waiting: list[tuple[Sample, bool]] = []
@@ -108,11 +113,11 @@ class Archive:
 
     def _begin(self, content: bytes = b'') -> None:
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        beside = f'# {self._named}\n{self._configuration()}'
-        write_file(self._path.with_suffix(_SETTINGS), beside, overwrite=True)
+        beside = joints_line(self._joints) + self._configuration()
+        write_file(settings_beside(self._path), beside, overwrite=True)
         if content:
             write_file(self._path, content, overwrite=True)
-        before, self._journal = self._journal, Journal(self._path, self._joints)
+        before, self._journal = self._journal, Journal(self._path, len(self._joints))
         if before is not None:
             before.close()
         self._due = False
@@ -137,22 +142,16 @@ class Archive:
         newest = self.newest_journal()
         if newest is None:
             return (), (f'nothing to resume in {self.folder}: a new session begins',)
-        self._path, beside = newest, newest.with_suffix(_SETTINGS)
-        text = beside.read_text('utf-8', 'replace') if beside.exists() else ''
-        named = text.partition('\n')[0].removeprefix('# ')
-        if named.startswith('joints: ') and named != self._named:
-            raise InputError(
-                f'{newest} has {named}; the chain has {self._named}: resume it with a chain of '
-                'its joints in its order, or start without resume'
-            )
+        self._path = newest
         try:
-            samples, warnings = read_journal(self._path, self._joints)
+            refuse_other_joints_than(self._joints, newest)
+            samples, warnings = read_journal(newest, len(self._joints))
         except InputError as err:
             raise InputError(
                 f'{err}. It is left untouched: repair it, move it away to continue the one '
                 'before, or start without resume to begin another'
             ) from err
-        self._journal = Journal(self._path, self._joints)
+        self._journal = Journal(self._path, len(self._joints))
         return samples, warnings
 
     def newest_journal(self) -> Path | None:
@@ -166,7 +165,7 @@ class Archive:
     def save(self, text: str, configuration: str, path: Path | None = None) -> Path:
         """Write a calibration with its configuration, if known; return its path."""
         path = path or self._new_path(_CALIBRATION)
-        beside = {path.with_suffix(_SETTINGS): configuration} if configuration else {}
+        beside = {settings_beside(path): configuration} if configuration else {}
         path.parent.mkdir(parents=True, exist_ok=True)
         write_together({path: text, **beside})
         return path

@@ -14,6 +14,7 @@ import csv
 import errno
 import fcntl
 import io
+import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -30,6 +31,8 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.sample import Sample, View
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
+
+ITS_JOINTS = '# joints: '  # what the settings beside a journal begin with
 
 
 class Journal:
@@ -114,6 +117,33 @@ class Journal:
         if written < len(data):  # the disk is full: no half row may stay
             os.ftruncate(self._file, begin)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def settings_beside(path: Path) -> Path:
+    """Return the path of the settings of a journal, which begin with its joints."""
+    return path.with_suffix('.settings.yaml')
+
+
+def joints_line(joints: Sequence[str]) -> str:
+    """Return the line that names the joints q1, q2, ... of a journal."""
+    return f'{ITS_JOINTS}{json.dumps(joints)}\n'
+
+
+def refuse_other_joints_than(joints: Sequence[str], path: Path) -> None:
+    """Refuse a journal of other joints, or in another order, if its settings name them."""
+    beside, ours = settings_beside(path), joints_line(joints)
+    if not beside.is_file():
+        return
+    with beside.open(encoding='utf-8', errors='replace') as file:
+        theirs = file.readline(LARGEST_TEXT)
+    if not theirs.startswith(ITS_JOINTS) or theirs.split() == ours.split():
+        return
+    theirs, ours = (line.removeprefix(ITS_JOINTS).strip() for line in (theirs, ours))
+    raise InputError(
+        f'{path} has the joints {theirs}; the chain has {ours}: give a chain with these '
+        'joints in this order; if they were only renamed, write the new names into the first line '
+        f'of {beside.name}'
+    )
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:

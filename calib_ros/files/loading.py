@@ -16,6 +16,7 @@ from calib_ros.errors import ColumnsError, TooFewObservationsError
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.bags import Replayed
 from calib_ros.files.foreign import Foreign
+from calib_ros.files.journal import refuse_other_joints_than
 from calib_ros.files.layouts import Layout
 from calib_ros.files.tables import read_table
 from calib_ros.identification.identification import identify_model
@@ -95,6 +96,7 @@ def table(
     """
     given = path, len(chain.joints), sessions, settings.sigmas, eye_in_hand
     if foreign is None:
+        refuse_other_joints_than(chain.joint_names, path)
         with suppress(ColumnsError):
             return read_table(*given, progress=progress)
         foreign = Foreign(Layout(), chain)

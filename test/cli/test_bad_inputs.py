@@ -2,8 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a command line cannot use is told in one line."""
 
+import json
+import shutil
+
 import pytest
 from measured import TRAIN, measured, rows_of, write_csv
+
+from calib_ros.kinematics.chain_file import load_chain
 
 
 def bad_inputs():
@@ -21,6 +26,8 @@ def bad_inputs():
     yield 'a column twice', (*csv_of, 'twice.csv'), 'are called x: rename all but one'
     yield 'too few rows', (*csv_of, 'few.csv'), 'too few different poses: 3 measured'
     yield 'only test rows', (*csv_of, 'judging.csv'), 'the table has no rows to fit'
+    swapped = 'order.csv has the joints ["elbow_joint", '
+    yield 'a journal of another order', (*csv_of, 'order.csv'), swapped
     yield 'no such bag', (*bag_of, 'missing'), 'no bag at missing'
     yield 'an empty bag folder', (*bag_of, 'folder'), 'no .mcap or .db3 file is in it'
     yield 'a chain as table', (*bag_of, 'broken.yaml'), 'but identify takes a table or a bag'
@@ -99,6 +106,9 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     table.rename(tmp_path / 'good.csv')
     write_csv(tmp_path / 'few.csv', rows[:3])
     write_csv(tmp_path / 'judging.csv', rows[TRAIN:])
+    shutil.copy(tmp_path / 'good.csv', tmp_path / 'order.csv')
+    names = sorted(load_chain('ur5e').joint_names)
+    (tmp_path / 'order.settings.yaml').write_text(f'# joints: {json.dumps(names)}\n')
     (tmp_path / 'twice.csv').write_text('q1,q2,q3,q4,q5,q6,x,y,z,x\n0,0,0,0,0,0,1,2,3,4\n')
     (tmp_path / 'link.csv').symlink_to('gone.csv')
     (tmp_path / 'empty').write_text('')

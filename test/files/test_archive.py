@@ -146,10 +146,14 @@ def test_a_journal_from_which_all_was_taken_back_is_resumed(tmp_path):
 def test_the_journal_of_a_robot_with_other_joints_is_refused(tmp_path):
     """In another order too: values would be those of other joints; without names it is resumed."""
     written(tmp_path, 1)
-    with pytest.raises(InputError, match=r'Z.csv has joints: \["a", "b"\]; .*: \["b", "a"\]'):
+    said = r'Z.csv has the joints \["a", "b"\]; the chain has \["b", "a"\]: .* without resume'
+    with pytest.raises(InputError, match=said):
         open_archive(tmp_path, joints=('b', 'a')).resume()
     assert stamps(tmp_path) == [1]
-    next(tmp_path.glob('*.settings.yaml')).write_text('settings: none\n')
+    (beside,) = tmp_path.glob('*.settings.yaml')
+    beside.write_text(beside.read_text().replace('["a", "b"]', '["c",  "b"]'))  # as it says
+    open_archive(tmp_path, joints=('c', 'b')).resume()
+    beside.write_text('settings: none\n')
     assert stamps(tmp_path) == [1]
     with pytest.raises(InputError, match='q3'):
         open_archive(tmp_path, joints=('a', 'b', 'c')).resume()
