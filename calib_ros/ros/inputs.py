@@ -183,6 +183,11 @@ class Inputs:
         except rclpy_implementation.RCLError as err:
             why = str(err).partition(', at /')[0]
             raise ConfigError(f'"{stream.topic}" is no topic name: {why}') from err
+        if name in self._topics and stream.type != CAMERA_INFO:  # it may be of several boards
+            raise ConfigError(
+                f'"{stream.topic}" is {name}, from which another input is taken: give each one '
+                'its own topic, and name it once'
+            )
         hearing = self._topics.setdefault(name, Hearing())
         hearing.latched = stream.still
         events = SubscriptionEventCallbacks(

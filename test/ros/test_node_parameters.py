@@ -132,6 +132,12 @@ def test_all_of_an_atomic_change_or_nothing(idle):
         ({'fixed': ['joint_2.a']}, 'unknown parameter "joint_2.a"'),
         ({'sources': ['/pose', '/pose type=Range']}, 'named twice'),
         ({'sources': ['/b{x}']}, '"/b{x}" is no topic name: failed to resolve name'),
+        ({'sources': ['/b', 'b']}, '"b" is /b, from which another input is taken: give each one'),
+        ({'joint_topics': ['a', 'a']}, '"a" is /a, from which another input is taken'),
+        (  # the poses that were fitted also judged
+            {'remap': ('measured_pose:=/a', 'validation_pose:=/a')},
+            '"validation_pose" is /a, from which another input is taken',
+        ),
         ({'max_gapp': 1.0}, 'did you mean "max_gap"'),
         ({'delay': 'none'}, 'parameter "delay" must be a finite number'),
         ({'serial': 12}, 'must be text, not 12: write it in quotes'),
