@@ -28,6 +28,10 @@ def test_boards_stand_in_the_view_of_a_camera_as_far_away_as_said(rng):
     chain = before_camera(load_chain('ur10e'), camera, points, True, rng)
     pixels = photograph(chain, camera, points, True, 10, rng).pixels
     assert ((pixels > 0.0) & (pixels < (camera.width, camera.height))).all()
+    across = np.linalg.norm(
+        pixels.reshape(10, 4, 2)[:, 0] - pixels.reshape(10, 4, 2)[:, 3], axis=1
+    )
+    assert 0.35 < across.mean() / np.hypot(camera.width, camera.height) < 0.65  # about half of it
 
 
 def test_a_simulated_lens_bends_the_corners_of_its_pictures_a_little():
