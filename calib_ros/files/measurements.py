@@ -384,4 +384,8 @@ def view_of(text: str, where: str) -> View:
         raise InputError(f'{where} must be a lens of 10 numbers, then x y z u v of each corner')
     corners = np.array(rows)
     values = dict(zip(LENS_KINDS, first, strict=False))
-    return View(corners[:, :3], corners[:, 3:], Lens(**values, fixed=bool(first[-1])))
+    try:
+        lens = Lens(**values, fixed=bool(first[-1]))
+    except ConfigError as err:
+        raise InputError(f'{where}: {err}') from err
+    return View(corners[:, :3], corners[:, 3:], lens)

@@ -333,7 +333,5 @@ def _lens(value: object, where: str) -> Lens:
     content = parse_mapping(value, (*LENS_KINDS, 'fixed'), where, IN_PIXELS)
     given = [kind for kind in LENS_KINDS if kind in content]
     numbers = {kind: parse_number(content[kind], f'{where}.{kind}') for kind in given}
-    if min(numbers['fx'], numbers['fy']) <= 0.0:
-        raise ConfigError(f'{where}: fx and fy must be positive, as focal lengths in pixels are')
     fixed = parse_like(True, content.get('fixed', True), f'{where}.fixed')
     return Lens(**numbers, fixed=fixed)

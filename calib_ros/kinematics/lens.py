@@ -44,6 +44,8 @@ class Lens:
         for kind in LENS_KINDS:
             if not np.isfinite(getattr(self, kind)):
                 raise ConfigError(f'{kind} of a camera must be a finite number')
+        if min(self.fx, self.fy) <= 0.0:
+            raise ConfigError('fx and fy of a camera must be positive, as focal lengths [px] are')
 
     @property
     def values(self) -> dict[str, float]:
@@ -51,8 +53,12 @@ class Lens:
         return {kind: float(getattr(self, kind)) for kind in LENS_KINDS}
 
     def moved(self, offsets: Mapping[str, float]) -> Lens:
-        """Return the lens with offsets added to its parameters."""
+        """Return the lens with offsets added to its parameters.
+
+        Focal lengths stay positive, so that a fit can recover.
+        """
         added = {kind: getattr(self, kind) + offsets[kind] for kind in offsets}
+        added |= {kind: max(added[kind], SAME) for kind in ('fx', 'fy') if kind in added}
         return replace(self, **added) if added else self
 
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -12,6 +12,7 @@ from calib_ros.errors import InputError
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.journal import Journal, read_journal, table_text
 from calib_ros.files.layouts import Layout
+from calib_ros.files.measurements import view_of
 from calib_ros.files.tables import read_table
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
@@ -109,6 +110,8 @@ def test_a_view_of_thousands_of_corners_is_read(tmp_path):
     ((found,), warnings) = read_journal(tmp_path / 'cell.csv', JOINTS)
     assert warnings == ()
     np.testing.assert_array_equal(found.view.pixels, seen.pixels)
+    with pytest.raises(InputError, match='line 2: fx and fy of a camera must be positive'):
+        view_of('0 1 1 1 0 0 0 0 0 1;1 1 1 1 1', 'line 2')  # which resume leaves out
 
 
 def test_the_samples_of_a_bag_are_a_table_with_any_names(tmp_path):

@@ -96,3 +96,14 @@ def test_a_lens_that_is_none_is_refused(lens, said):
         parse_chain(text, 'file')
     with pytest.raises(ConfigError, match='fx of a camera must be a finite number'):
         Lens(np.inf, 1.0, 0.0, 0.0)
+    for lengths in ((0.0, 1.0), (1.0, -1.0)):
+        with pytest.raises(ConfigError, match='fx and fy of a camera must be positive'):
+            Lens(*lengths, 0.0, 0.0)
+
+
+def test_a_step_too_far_leaves_a_lens():
+    """So that a fit can go back."""
+    far = Lens(9e2, 8e2, 3e2, 2e2).moved({'fx': -1e3, 'fy': -1e3, 'cx': 1.0})
+    pixels, slopes = far.project(points_of([(0.1, 0.2, 1.0)]))
+    np.testing.assert_allclose(pixels[:, 0], [301.0, 200.0])
+    assert np.isfinite(slopes).all()
