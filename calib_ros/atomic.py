@@ -115,6 +115,20 @@ def whole_folder(
         os.close(claim)
 
 
+def remove_leftovers(folder: Path, begin: str) -> None:
+    """Remove what killed processes left of new files and folders, by the start of their names.
+
+    What was moved aside stays, and what another process writes.
+    """
+    for work in folder.iterdir():
+        if not (work.name.startswith(f'.{begin}') and work.suffix == '.partial'):
+            continue
+        with suppress(OSError, InputError), ExitStack() as stack:
+            stack.callback(os.close, _claim(work, work))
+            if not {'.old', '.earlier'} & {each.suffix for each in work.iterdir()}:
+                shutil.rmtree(work)
+
+
 def refuse_to_replace(path: Path, overwrite: bool = False, cure: str = 'move it') -> None:
     """Refuse a path in use, except a file to `overwrite`; the message offers a `cure`."""
     try:

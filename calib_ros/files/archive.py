@@ -15,7 +15,14 @@ from pathlib import Path
 from tempfile import TemporaryFile, mkdtemp
 from urllib.parse import quote
 
-from calib_ros.atomic import short_name, whole_folder, write_file, write_files, write_together
+from calib_ros.atomic import (
+    remove_leftovers,
+    short_name,
+    whole_folder,
+    write_file,
+    write_files,
+    write_together,
+)
 from calib_ros.errors import InputError, trouble
 from calib_ros.files.journal import (
     Journal,
@@ -59,6 +66,7 @@ class Archive:
             folder.mkdir(parents=True, exist_ok=True)
             with TemporaryFile(dir=folder):
                 pass
+            remove_leftovers(folder, f'{self._robot}_')
         except OSError as err:
             why = f'poses cannot be kept in {folder} ({err.strerror})'
             raise InputError(f'{why}: set data_dir to a writable folder') from err

@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import fcntl
 import os
 import resource
 import shutil
@@ -41,6 +42,14 @@ def stamps(folder, robot='arm'):
         samples, _ = archive.resume()
         archive.close()
     return [each.stamp_ns for each in samples]
+
+
+@contextmanager
+def open_folder(path):
+    handle = os.open(path, os.O_RDONLY)
+    fcntl.flock(handle, fcntl.LOCK_EX)
+    yield
+    os.close(handle)
 
 
 @contextmanager
@@ -157,6 +166,18 @@ def test_the_journal_of_a_robot_with_other_joints_is_refused(tmp_path):
     assert stamps(tmp_path) == [1]
     with pytest.raises(InputError, match='q3'):
         open_archive(tmp_path, joints=('a', 'b', 'c')).resume()
+
+
+def test_what_killed_nodes_leave_is_removed_by_the_next(tmp_path):
+    """Names with the time are never written again, so it piled up."""
+    made = {'save': 'a1.0.partial', 'export': 'dh.csv', 'folder': 'x.old', 'other': 'a1.0.partial'}
+    works = {name: tmp_path / f'.arm_2026_{name}.partial' for name in made}
+    for name, inside in made.items():
+        works[name].mkdir()
+        (works[name] / inside).write_text('half')
+    with open_folder(works['other']):  # another node writes
+        open_archive(tmp_path)
+    assert [name for name, work in works.items() if work.exists()] == ['folder', 'other']
 
 
 def test_a_full_disk_loses_nothing(tmp_path):
