@@ -48,6 +48,7 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.values import MOST_NAMES
 
 LEADING_ZEROS = re.compile('(?<![0-9.])0+(?=[0-9])')
+PARTS = re.compile(r'[^\W\d_]+|[0-9]+')
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,15 +258,18 @@ class _Table:
     def labels(self, other: _Table) -> Iterator[tuple[str, str, list[str]]]:
         """Yield columns that may name the poses of both tables: a kind, the name, and the cells.
 
-        Numbers name them under one name, their kind. Capitals and leading zeros may differ.
+        Numbers name them under one name, their kind. Capitals, leading zeros and the signs in
+        names may differ: P[1], p_01.
         """
         theirs = {name.lower() for name in other._sheet.header}
         for k, name in enumerate(self._sheet.header, start=1):
             number = math.isfinite(self._first(f'#{k}'))
             if name and (not number or name.lower() in theirs):
                 cells = self._sheet.columns.texts(f'#{k}')
-                same = (LEADING_ZEROS.sub('', cell.lower()).removesuffix('.0') for cell in cells)
-                yield name.lower() if number else '', name, [*same]
+                bare = [LEADING_ZEROS.sub('', cell.lower()).removesuffix('.0') for cell in cells]
+                if not number:
+                    bare = ['.'.join(PARTS.findall(cell)) or cell for cell in bare]
+                yield name.lower() if number else '', name, bare
 
     def columns(self) -> Columns:
         """Return our columns: words, and numbers in m and rad."""

@@ -49,11 +49,11 @@ LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """The rows of a table in columns `#1`, `#2` ..., their names, and the lines `above`."""
+    """The rows of a table in columns `#1`, `#2` ..., their names, and its lines of words."""
 
     path: Path
     header: tuple[str, ...]
-    above: tuple[str, ...]
+    words: tuple[str, ...]
     columns: Columns
     notes: tuple[str, ...]
 
@@ -153,32 +153,32 @@ def _sheet(
     if decimal == ',' and not layout.decimal:
         notes.append('numbers have decimal commas (--decimal)')
     first = _first(path, head, at, used, decimal, notes)
-    if at < 0 and first:  # columns by their numbers
+    if at < 0:  # columns by their numbers
         header = tuple(f'#{k + 1}' for k in range(len(head[first][1])))
     of_groups = [_over_groups(cells, len(header)) for _, cells in head[: max(at, 0)][-1:]]
     header = _with_units(header, [*(cells for _, cells in head[at + 1 : first]), *of_groups])
-    above = ['\t'.join(cells) for _, cells in head[: first if at < 0 else at]]
-    left: list[int] = []
+    above = head[: first if at < 0 else at]
+    left: list[Cells] = []
     again = [cells for _, cells in head[at:first]]
     body = _without_words(chain([whole[first:]], rows), again, left)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
     if at >= 0 and max(used, default=0) < len(header):
         _refuse_shifted(columns, len(header))
     if left:
-        notes.append(f'there are no numbers in {lines_in_words(left)}: skipped')
+        without = lines_in_words([line for line, _ in left])
+        notes.append(f'there are no numbers in {without}: skipped')
     header = (*header, *[''] * (len(columns.header) - len(header)))
-    return Sheet(
-        path, header, (*content.comments, *above), replace(columns, decimal=decimal), tuple(notes)
-    )
+    words = (*content.comments, *('\t'.join(cells) for _, cells in (*above, *left)))
+    return Sheet(path, header, words, replace(columns, decimal=decimal), tuple(notes))
 
 
 def _without_words(
-    blocks: Iterable[list[Cells]], head: Sequence[list[str]], left: list[int]
+    blocks: Iterable[list[Cells]], head: Sequence[list[str]], left: list[Cells]
 ) -> Iterator[list[Cells]]:
-    """Yield the rows but comments, remarks and the `head` again, whose lines go into a list."""
+    """Yield the rows but comments, remarks and the `head` again, which go into a list."""
     for block in blocks:
         words = [
-            line
+            (line, cells)
             for line, cells in block
             if (
                 len(cells) - cells.count('') <= 2 or cells[0].startswith(COMMENTS) or cells in head
@@ -186,7 +186,7 @@ def _without_words(
             and not any(_is_number(cell, ',') for cell in cells)
         ]
         left += words
-        yield [row for row in block if row[0] not in words] if words else block
+        yield [row for row in block if row not in words] if words else block
 
 
 def _refuse_shifted(columns: Columns, width: int) -> None:

@@ -46,11 +46,15 @@ class Units:
         turns = [name for name in joints if name not in slides]
         main = [name for name in turns if name[0] == 'q']
         given: dict[str, str] = {name: getattr(layout, name) for name in layout.insisted}
-        angle, usual = given.get('angle', ''), self._above('angles', ANGLES, layout.angle)
+        angle = given.get('angle', '')
+        usual = self._in_words(
+            'angles', ANGLES, layout.angle, angle or given.get('joint_angle', '')
+        )
+        length = given.get('length', '')
         found = self._told(
             'length',
-            given.get('length', ''),
-            self._above('lengths', LENGTHS, layout.length),
+            length,
+            self._in_words('lengths', LENGTHS, layout.length, length),
             (*POSITION, 'distance'),
             (*slides, *SIGMAS[:3]),
         )
@@ -68,16 +72,27 @@ class Units:
         if self._assumed:
             self.notes.append(f'no units are given: taking {", ".join(self._assumed)}')
 
-    def _above(self, what: str, units: Mapping[str, float], usual: str) -> str:
-        """Return the one of some units that the lines above the header tell, or the usual one."""
-        for line in self._sheet.above:
-            for words in UNITS_ARE.findall(line):
-                told = [UNIT_SIGNS.get(word.lower(), '') for word in words]
-                if known := [unit for unit in told if unit in units]:
-                    if known[-1] != usual:  # the last: `units: in mm`
-                        self.notes.append(f'its head gives the unit {known[-1]} of {what}')
-                    return known[-1]
-        return usual
+    def _in_words(self, what: str, units: Mapping[str, float], usual: str, given: str) -> str:
+        """Return the one of some units that lines of words tell, or the usual one.
+
+        Lines that tell several are refused, unless one is given.
+        """
+        found = [words for line in self._sheet.words for words in UNITS_ARE.findall(line)]
+        known = [[UNIT_SIGNS.get(word.lower(), '') for word in words] for words in found]
+        told = dict.fromkeys(
+            ours[-1]  # the last: `units: in mm`
+            for words in known
+            if (ours := [unit for unit in words if unit in units])
+        )
+        if len(told) > 1 and not given:
+            raise InputError(
+                f'{self._sheet.path}: {what} are in {" and ".join(told)}, as its lines of units '
+                f'say: split the file there, or give --{what.removesuffix("s")} if one holds'
+            )
+        unit = next(iter(told), usual)
+        if unit != usual:
+            self.notes.append(f'its lines of units say that {what} are in {unit}')
+        return unit
 
     def _told(
         self, option: str, given: str, usual: str, main: Sequence[str], more: Sequence[str]

@@ -238,13 +238,17 @@ def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_h
         ('Point,x,y,z\na,1,0,0\nb,2,0,0\nc,3,0,0\n', 'Point,q1\na,1\nb,2\nd,3\n', '"c"'),
         ('No,x,y,z\n1,1,0,0\n2,2,0,0\n3,3,0,0\n', 'No,q1\n0,1\n1,2\n2,3\n', '"3"'),
         ('No,x,y,z\n1,1,0,0\n2,2,0,0\n3,3,0,0\n', 'Row,q1\n0,1\n1,2\n2,3\n', ''),
+        ('Point,x,y,z\nP_2,2,0,0\nP_1,1,0,0\n', 'Position,q1\nP[1],1\nP[2],2\n', ''),
+        ('A,P2,2,0,0\nA,P10,10,0,0\n', 'Point,q1\nP[10],10\nP[2],2\n', ''),
+        ('Point,x,y,z\nP1.1,2,0,0\nP11,1,0,0\n', 'Position,q1\nP1.1,2\nP11,1\n', ''),
     ],
 )
 def test_names_of_poses_need_no_column_of_the_same_name(tmp_path, points, log, odd):
     """Joint values of other poses were taken, row by row, without a word."""
     (tmp_path / 'log.csv').write_text(log)
     (tmp_path / 'points.csv').write_text(points)
-    given = Foreign(Layout(), None, tmp_path / 'log.csv')
+    numbered = {'x': '#3', 'y': '#4', 'z': '#5'} if points.startswith('A') else {}
+    given = Foreign(Layout(columns=numbered), None, tmp_path / 'log.csv')
     if odd:
         with pytest.raises(InputError, match=f'{odd} of its column .* must be in one row'):
             read_table(tmp_path / 'points.csv', 1, foreign=given)
