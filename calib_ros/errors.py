@@ -58,14 +58,18 @@ class InputError(CalibrationError):
 
 
 class UnknownNameError(ConfigError):
-    """A name that does not exist, with the valid alternatives."""
+    """A name that does not exist, with the valid alternatives: the nearest, or what to do."""
 
-    def __init__(self, what: str, name: str, alternatives: Iterable[str]) -> None:
+    def __init__(
+        self, what: str, name: str, alternatives: Iterable[str], otherwise: str = ''
+    ) -> None:
         self.what = what
         self.name = name
         self.alternatives = tuple(alternatives)
         hint, listed = near(str(name), self.alternatives), ', '.join(self.alternatives)
-        if not hint or len(listed) <= LONGEST_NAME:
+        if otherwise:
+            hint = f'valid: {listed}; {otherwise}'
+        elif not hint or len(listed) <= LONGEST_NAME:
             hint = f'{hint} valid: {listed}'.strip()
         *place, of = what.rpartition(': ')
         super().__init__(f'{"".join(place)}unknown {of} "{name}": {hint}')
@@ -92,8 +96,9 @@ def near(name: str, alternatives: Iterable[str], least: float = 0.5) -> str:
     import difflib  # slow to load
 
     likely = list(alternatives)[:MOST_ENTRIES] if len(name) <= MOST_ENTRIES else []
-    found = difflib.get_close_matches(name, likely, n=1, cutoff=least)
-    return f'did you mean "{found[0]}"?' if found else ''
+    small = {each.lower(): each for each in likely}
+    found = difflib.get_close_matches(name.lower(), small, n=1, cutoff=least)
+    return f'did you mean "{small[found[0]]}"?' if found else ''
 
 
 def unreadable(path: Path, err: OSError, what: str = '') -> str:

@@ -55,7 +55,7 @@ URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
 
 @as_annotated
 def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
-    """Read a chain file, a URDF, or a supplied robot by name, such as "ur10e".
+    """Read a chain file, a URDF, or a supplied robot by name, such as "ur10e" or "UR10e".
 
     Base and tool of a URDF are omitted: they lead to its links, not to the measuring device and
     its target.
@@ -65,11 +65,10 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
         return replace(read_urdf(path), base=None, tool=None)
     if not path.suffix and not path.is_file():
         robots = shipped_robots()
-        if str(name_or_path) not in robots:
-            raise UnknownNameError(
-                'robot (or path of a chain file or URDF)', str(name_or_path), robots
-            )
-        path = robots[path.name]
+        if (name := str(name_or_path).lower()) not in robots:
+            another = 'another arm needs a URDF or a chain file'  # a UR5 is no UR5e
+            raise UnknownNameError('robot', str(name_or_path), robots, another)
+        path = robots[name]
     chain = parse_chain(chain_text(path), str(path))
     _refuse_degrees(chain, str(path))
     return chain
