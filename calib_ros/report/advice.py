@@ -110,13 +110,18 @@ FINER = (
     '(--sigma-position, in metres): the measurements scatter by only {:.2g} mm.'
 )
 """First step if a correction is uncertain by the stated noise of the device alone."""
+OUTLYING = (
+    'Look at what fits far worse than the rest ({} poses; in the report: outliers only): what do '
+    'these have in common?'
+)
+"""First step if much is left, and it is not alike everywhere."""
 
 
 @dataclass(frozen=True)
 class Situation:
     """Different poses, residual over stated noise, that noise [m], and what else is known.
 
-    Whether model is auto, and whether poses share errors in succession only.
+    Whether model is auto, poses share errors in succession only, and how many are outliers.
     """
 
     poses: int = ENOUGH
@@ -124,6 +129,7 @@ class Situation:
     sigma: float | None = None
     auto: bool = False
     drifts: bool = False
+    outliers: int = 0
 
     def said_of(self, one: Advice) -> Advice:
         """Return the advice on an unproven correction that suits the situation."""
@@ -161,6 +167,9 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
         refusal = replace(refusal, steps=tuple(steps))
         if rule in {Rule.GAIN, Rule.REGION}:
             refusal = situation.said_of(refusal)
+        if rule is Rule.LARGEST_ERROR and situation.outliers:
+            first = OUTLYING.format(situation.outliers)
+            refusal = replace(refusal, steps=(first, *refusal.steps))
         if rule is Rule.GAIN and situation.drifts:
             again = rules()[Rule.DRIFT].again
             refusal = replace(refusal, steps=(DRIFTS, *refusal.steps), again=again)

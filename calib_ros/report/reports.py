@@ -167,7 +167,8 @@ def advice_of(result: Identification) -> tuple[Advice, ...]:
     poses = sum(map(distinct, numbers))
     sigma = None if result.images else result.noise.given.get('sigma_position')
     auto, drifts = bool(result.verdicts), words.drifts(result.noise)
-    return advice(result.refusals, Situation(poses, noise, sigma, auto, drifts))
+    situation = Situation(poses, noise, sigma, auto, drifts, len(result.outliers))
+    return advice(result.refusals, situation)
 
 
 def may_be_closer(result: Identification, beyond: bool = False) -> bool:

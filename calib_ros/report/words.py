@@ -357,7 +357,8 @@ def cameras_in_words(result: Identification) -> list[str]:
 
 def observability_in_words(result: Identification) -> str:
     """Return the observability indices."""
-    return ', '.join(f'{name.upper()} {x:.4g}' for name, x in result.observability.items())
+    found = {name: float(f'{x:.3g}') for name, x in result.observability.items()}
+    return ', '.join(f'{name.upper()} {x:,g}' for name, x in found.items())
 
 
 def against_truth(result: Identification, truth: Chain) -> str:

@@ -53,6 +53,13 @@ def test_no_gain_is_told_by_how_much_was_measured_and_what_is_left():
     assert 'noise of 0.46 mm in each direction; sigma_position is 0.1 mm' in enough.meaning
 
 
+def test_outliers_are_to_be_looked_at_if_much_is_left():
+    refused = [Reason(Rule.LARGEST_ERROR, 'RMS 12.3 mm remains')]
+    (told,) = advice.advice(refused, advice.Situation(outliers=12))
+    assert '(12 poses; in the report' in told.steps[0]
+    assert told.steps[1:] == advice.rules()[Rule.LARGEST_ERROR].steps
+
+
 def test_errors_shared_in_succession_ask_for_random_order_first():
     """A good arm seen by a device that drifts was told to look for errors of its gears."""
     here = advice.Situation(poses=40, drifts=True)
