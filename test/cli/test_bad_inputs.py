@@ -31,7 +31,7 @@ def bad_inputs():
     yield 'no such bag', (*bag_of, 'missing'), 'no bag at missing'
     yield 'an empty bag folder', (*bag_of, 'folder'), 'no .mcap or .db3 file is in it'
     yield 'a chain as table', (*bag_of, 'broken.yaml'), 'but identify takes a table or a bag'
-    yield 'no such robot', (*chain_of, 'ur10x'), 'did you mean "ur10'
+    yield 'no such robot', (*chain_of, 'ur10x'), 'valid: abb_irb120'
     yield 'no chain', (*chain_of, 'good.csv'), 'good.csv'
     yield 'another number of joints', (*chain_of, 'franka_panda'), 'q7'
     yield 'a frame is no parameter', (*good, '--fixed', 'base.x'), 'fixed: true'
