@@ -42,7 +42,7 @@ from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, InOrder, r
 from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.identifying import Filer, Identifying
 from calib_ros.ros.inputs import Batched, Inputs, deserialised
-from calib_ros.ros.outputs import FILENAMES, Keeper
+from calib_ros.ros.outputs import FILENAMES, UNSAVED, Keeper
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown_names
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.batches import Stream, feed, source_streams
@@ -166,6 +166,8 @@ class CalibrationNode(Batched):
         running = [name for name in late if not working[name].join(0.0)]
         for name in running:  # the caller hears no more
             log.warning(f'ended before the answer of {name}')
+        if self._keeper.unsaved:
+            log.warning(UNSAVED)
         self.destroy_node()
         return helped and not running
 

@@ -32,6 +32,8 @@ from calib_ros.sampling.sources import parse_sources
 
 FILENAMES = ('target_filename', 'calibration_filename')  # parameters that name files
 
+UNSAVED = 'the calibration identified before was not saved: to get it, identify its poses again'
+
 
 class Published(NamedTuple):
     """A calibration as the text of a file, with its settings, if known.
@@ -63,6 +65,7 @@ class Keeper:
         self._node, self._session, self._archive = node, session, archive
         self._given, self._urdf, self._adopted = given, urdf, adopted
         self._published = Published('', '')
+        self.unsaved = False  # True if the calibration in use was identified and not saved
         self._lock = threading.Lock()  # identifications end on their own thread
         self._posed: tuple[int, Sequence[float]] | None = None
         self._dh_parameters = node.create_publisher(Float64MultiArray, '~/dh_parameters', LATCHED)
@@ -83,7 +86,7 @@ class Keeper:
         """Use a calibration (`CalibrationSession.adopt`)."""
         with self._lock:
             self._session.adopt(calibration, samples)
-            self._published = published
+            self._published, self.unsaved = published, samples is not None
             self._dh_parameters.publish(to_ros.dh_parameters(calibration.chain))
             self._calibration.publish(String(data=published.text))
             self._broadcast.publish(calibration.chain, calibration.world_frame)
@@ -102,6 +105,8 @@ class Keeper:
         """
         published, target = found
         path = self._archive.save(published.text, published.configuration, target)
+        if published is self._published:
+            self.unsaved = False
         written = [path]
         try:
             page = published.page()
@@ -129,8 +134,9 @@ class Keeper:
         text = _calibration_text(path)
         calibration = parse_calibration(text, str(path), session.chain, session.settings)
         calibration.serial_of(str(path), self._given.serial)
+        lost = f'; {UNSAVED}' * self.unsaved
         self.adopt(calibration, Published(text, ''))
-        return f'{path}, {calibration.whose}'
+        return f'{path}, {calibration.whose}{lost}'
 
     def exportable(self) -> tuple[Calibration, FloatArray | None]:
         """Return the calibration, and the joint values (N, n) of the samples."""

@@ -18,6 +18,7 @@ from std_msgs.msg import String
 from calib_ros.files.archive import Archive
 from calib_ros.files.journal import read_journal
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.ros.outputs import UNSAVED
 
 
 @pytest.fixture
@@ -141,6 +142,27 @@ def test_ended_while_an_identification_runs(journal):
         assert child.end() == 0, child.output
         assert 'Traceback' not in child.output
         assert 'ended before the answer of ~/identify' in child.output
+
+
+def test_a_calibration_that_was_not_saved_is_told_of(journal):
+    """Who forgot ~/save heard nothing, and had to identify again."""
+    first = {'chain': 'ur10e', 'data_dir': str(journal)}
+    with Cell() as cell:
+        told = cell.log()
+        node = cell.start(**first, resume=True)
+        cell.done('identify')
+        assert 'not saved' not in cell.done('save').message
+        assert 'not saved' not in cell.done('load').message
+        cell.done('identify')
+        assert cell.done('load').message.endswith(UNSAVED)
+        cell.done('identify')
+        cell.executor.remove_node(node)
+        cell.nodes.remove(node)
+        assert node.close()
+        cell.spin_until(lambda: any(UNSAVED in each.msg and each.level == 30 for each in told))
+        node = cell.start(**first)
+        cell.done('load')
+    assert sum(UNSAVED in each.msg and each.level == 30 for each in told) == 1
 
 
 SLOW_SAVE = """
