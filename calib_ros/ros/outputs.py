@@ -116,7 +116,10 @@ class Keeper:
                 written.append(report)
         except Exception as err:  # the calibration is saved without the page
             self._node.get_logger().warning(f'the report of {path} is not written: {trouble(err)}')
-        return True, f'saved to {", ".join(map(str, written))}'
+        text = f'saved to {", ".join(map(str, written))}'
+        if target not in (None, self._named('calibration_filename')):  # not the newest by its name
+            text += '; to load it set calibration_filename to it'
+        return True, text
 
     def at_start(self) -> tuple[Path | None, bool]:
         """Return the calibration file found at startup, and whether to load it."""

@@ -109,6 +109,17 @@ def test_files_are_written_into_the_folders_only(cell, data, tmp_path):
     assert 'exists already' in save(cell, 'new.yaml').message
 
 
+def test_a_file_with_a_name_of_its_own_is_loaded_by_this_name(cell):
+    """~/load and autoload took an older one, the newest by the time in its name."""
+    assert load(cell, 'good.yaml').success
+    saved = save(cell, 'new.yaml')
+    assert saved.message.endswith('; to load it set calibration_filename to it')
+    (result,) = cell.set_parameters({'calibration_filename': 'newer.yaml'})
+    assert result.successful
+    assert 'calibration_filename' not in save(cell, 'newer.yaml').message
+    assert 'calibration_filename' not in save(cell, '').message
+
+
 def test_a_name_that_was_good_is_looked_at_again(cell, data, tmp_path):
     """A link may be put in its place after it was set."""
     assert load(cell, 'good.yaml').success
