@@ -151,8 +151,8 @@ class Archive:
         if newest is None:
             return (), (f'nothing to resume in {self.folder}: a new session begins',)
         self._path = newest
+        refuse_other_joints_than(self._joints, newest)
         try:
-            refuse_other_joints_than(self._joints, newest)
             samples, warnings = read_journal(newest, len(self._joints))
         except InputError as err:
             raise InputError(

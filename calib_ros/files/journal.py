@@ -18,6 +18,7 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.sample import Sample, View
+from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
 
 ITS_JOINTS = '# joints: '  # what the settings beside a journal begin with
@@ -131,19 +133,25 @@ def joints_line(joints: Sequence[str]) -> str:
 
 def refuse_other_joints_than(joints: Sequence[str], path: Path) -> None:
     """Refuse a journal of other joints, or in another order, if its settings name them."""
-    beside, ours = settings_beside(path), joints_line(joints)
+    beside = settings_beside(path)
     if not beside.is_file():
         return
     with beside.open(encoding='utf-8', errors='replace') as file:
-        theirs = file.readline(LARGEST_TEXT)
-    if not theirs.startswith(ITS_JOINTS) or theirs.split() == ours.split():
+        line = file.readline(LARGEST_TEXT)
+    if not line.startswith(ITS_JOINTS):
         return
-    theirs, ours = (line.removeprefix(ITS_JOINTS).strip() for line in (theirs, ours))
-    raise InputError(
-        f'{path} has the joints {theirs}; the chain has {ours}: give a chain with these '
-        'joints in this order; if they were only renamed, write the new names into the first line '
-        f'of {beside.name}'
-    )
+    try:
+        theirs = [str(name) for name in json.loads(line.removeprefix(ITS_JOINTS))]
+    except (ValueError, TypeError) as err:
+        raise InputError(f'{beside} must begin with {joints_line(joints).strip()}') from err
+    pairs = enumerate(zip_longest(theirs, joints, fillvalue='none'), 1)
+    other = [f'q{k} is {its}, in the chain {ours}' for k, (its, ours) in pairs if its != ours]
+    if other:
+        raise InputError(
+            f'{path} is of other joints: {"; ".join(some(other))}: give the chain it was measured '
+            'with; if joints were only renamed, write the new names into the first line of '
+            f'{beside.name}'
+        )
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:

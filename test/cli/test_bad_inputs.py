@@ -26,7 +26,7 @@ def bad_inputs():
     yield 'a column twice', (*csv_of, 'twice.csv'), 'are called x: rename all but one'
     yield 'too few rows', (*csv_of, 'few.csv'), 'too few different poses: 3 measured'
     yield 'only test rows', (*csv_of, 'judging.csv'), 'the table has no rows to fit'
-    swapped = 'order.csv has the joints ["elbow_joint", '
+    swapped = 'order.csv is of other joints: q1 is elbow_joint, in the chain shoulder_pan_joint; '
     yield 'a journal of another order', (*csv_of, 'order.csv'), swapped
     yield 'no such bag', (*bag_of, 'missing'), 'no bag at missing'
     yield 'an empty bag folder', (*bag_of, 'folder'), 'no .mcap or .db3 file is in it'

@@ -14,6 +14,7 @@ import pytest
 
 from calib_ros.errors import InputError
 from calib_ros.files.archive import Archive
+from calib_ros.files.journal import joints_line
 from calib_ros.files.tables import read_table
 from calib_ros.sampling.sample import Sample
 
@@ -155,13 +156,20 @@ def test_a_journal_from_which_all_was_taken_back_is_resumed(tmp_path):
 def test_the_journal_of_a_robot_with_other_joints_is_refused(tmp_path):
     """In another order too: values would be those of other joints; without names it is resumed."""
     written(tmp_path, 1)
-    said = r'Z.csv has the joints \["a", "b"\]; the chain has \["b", "a"\]: .* without resume'
+    said = r'Z.csv is of other joints: q1 is a, in the chain b; q2 is b, in the chain a: give'
     with pytest.raises(InputError, match=said):
         open_archive(tmp_path, joints=('b', 'a')).resume()
     assert stamps(tmp_path) == [1]
     (beside,) = tmp_path.glob('*.settings.yaml')
     beside.write_text(beside.read_text().replace('["a", "b"]', '["c",  "b"]'))  # as it says
     open_archive(tmp_path, joints=('c', 'b')).resume()
+    beside.write_text('# joints: [c, b]')
+    with pytest.raises(InputError, match=r'yaml must begin with # joints: \["a", "b"\]$'):
+        stamps(tmp_path)
+    many = tuple(f'a_joint_with_a_long_name_{k}' for k in range(7))
+    beside.write_text(joints_line(many))
+    with pytest.raises(InputError, match=f'first line of {beside.name}$'):  # never cut off
+        stamps(tmp_path)
     beside.write_text('settings: none\n')
     assert stamps(tmp_path) == [1]
     with pytest.raises(InputError, match='q3'):
