@@ -12,6 +12,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
+from datetime import datetime, timezone
 from itertools import chain, takewhile
 from typing import Any
 
@@ -67,6 +68,20 @@ def rows_in_words(
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     words = [' to '.join(map(str, dict.fromkeys((run[0], run[-1])))) for run in runs]
     return f'{"line" if by_line else "pose"}{"s" * (len(rows) > 1)} {", ".join(some(words))}'
+
+
+def is_time(stamp_ns: int) -> bool:
+    """Tell whether a stamp is a time (from 1973), not since a start or from lines."""
+    return stamp_ns >= 10**17
+
+
+def moment(stamp_ns: int) -> str:
+    """Return a stamp as a time, or as seconds, to a millisecond."""
+    seconds, rest = divmod(stamp_ns // 10**6, 1000)
+    if not is_time(stamp_ns):
+        return f'{seconds}.{rest:03d} s'
+    time = datetime.fromtimestamp(seconds, timezone.utc)
+    return f'{time:%Y-%m-%d %H:%M:%S}.{rest:03d} UTC'
 
 
 class Shown:

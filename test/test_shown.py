@@ -20,7 +20,7 @@ from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.report.words import interval_mm
-from calib_ros.shown import Shown, rounded, rows_in_words
+from calib_ros.shown import Shown, moment, rounded, rows_in_words
 
 CHAIN = calib_ros.load_chain('ur10e')
 JOINTS = CHAIN.random_joints(200, np.random.default_rng(1))
@@ -34,6 +34,18 @@ PLAN = partial(plan, DESIGN, **PLANNED | {'count': 3})
 CORRECTED = calib_ros.Compensator(CHAIN, ARM.chain)
 NOT_NUMBERS = (JOINTS > 0.0, JOINTS + 1j, JOINTS.astype('datetime64[s]'), JOINTS.astype(str), 'a')
 VALUES = (CHAIN, SEEN, PROBLEM, RESULT, ARM, RESULT.posterior)
+
+
+@pytest.mark.parametrize(
+    ('stamp_ns', 'text'),
+    [
+        (1_760_432_012_000_000_000, '2025-10-14 08:53:32.000 UTC'),
+        (1_760_432_012_034_567_800, '2025-10-14 08:53:32.034 UTC'),
+        (3_500_000_001, '3.500 s'),
+    ],
+)
+def test_a_stamp_is_told_as_a_time_or_in_seconds(stamp_ns, text):
+    assert moment(stamp_ns) == text
 
 
 @pytest.mark.parametrize('value', VALUES, ids=lambda value: type(value).__name__)

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.observations import Observations
-from calib_ros.shown import rows_in_words
+from calib_ros.shown import moment, rows_in_words
 
 FRAMES = ('base', 'tool')
 OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
@@ -57,7 +57,7 @@ class Step:
         """Return the reason to refuse a result."""
         where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
         where += f' of set {self.set + 1}' if self.set else ''
-        when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
+        when = f'stamp {moment(self.stamp_ns)}'
         line = rows_in_words([0], np.array([self.stamp_ns]))
         if line.startswith('line'):  # instead of a clock
             where = line if self.image is None else f'{where}, {line}'

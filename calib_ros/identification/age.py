@@ -17,6 +17,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import GROWTH
+from calib_ros.shown import is_time
 
 YEAR = timedelta(days=365.25)
 A_DAY = timedelta(days=1)  # clocks of any two time zones differ by less
@@ -27,11 +28,6 @@ def drift_of(names: Sequence[Parameter], growth: float = GROWTH) -> FloatArray:
     """Return variances (P,) of the usual drift (a random walk) a year, by that of lengths [m]."""
     sizes = [growth / SIZES['m'] * SIZES[name.unit] if name.of_dh else 0.0 for name in names]
     return np.square(sizes)
-
-
-def is_time(stamp_ns: int) -> bool:
-    """Tell whether a stamp is a time (from 1973), not since a start or from lines."""
-    return stamp_ns >= 10**17
 
 
 def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None) -> datetime:

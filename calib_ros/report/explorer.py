@@ -67,6 +67,7 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
         'kinds': kinds,
         'number': (rows + 1).tolist() if many else None,
         'lines': poses.by_line,
+        'clock': poses.timed,
         'things': poses.things,
         'images': [poses.source(row) if poses.corner[row] else '' for row in rows.tolist()]
         if poses.images

@@ -27,6 +27,7 @@ from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.kinematics.walk import BLOCK
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Settings
+from calib_ros.shown import is_time, moment
 
 FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
 """Roles: fitted; left out to judge; left out at a fitted configuration, not judged."""
@@ -81,14 +82,19 @@ class Poses:
             return 'measurements' if self.repeats else 'poses'
         return 'corners' if self.corner.all() else 'measurements'
 
+    @property
+    def timed(self) -> bool:
+        """Tell whether the stamps are times."""
+        return len(self) > 0 and not self.by_line and is_time(int(self.stamps_ns[0]))
+
     def source(self, row: int) -> str:
-        """Return the source of a row: image, line of the table, or stamp [s]."""
+        """Return the source of a row: image, line of the table, or stamp."""
         stamp = int(self.stamps_ns[row])
         if self.corner[row] and (name := self.images.get(stamp // 10**9)):
             return name
         if self.by_line:
             return f'line {stamp // 10**9}'
-        return f'{stamp // 10**9}.{stamp % 10**9:09d} s'
+        return moment(stamp)
 
     def select(self, rows: NDArray[np.generic]) -> Poses:
         """Return some poses by a mask (N,) or indices (K,)."""

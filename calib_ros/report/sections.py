@@ -13,7 +13,6 @@ import numpy as np
 
 import calib_ros
 from calib_ros.decision.comparison import Comparison, ErrorFigures
-from calib_ros.identification.age import is_time
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, words
@@ -103,7 +102,7 @@ def identity_of(
 
 
 def _measured(poses: Poses | None) -> str:
-    if poses is None or not len(poses) or poses.by_line or not is_time(poses.stamps_ns[0]):
+    if poses is None or not poses.timed:
         return ''
     first, last = (
         datetime.fromtimestamp(int(stamp) // 10**9, timezone.utc).strftime('%Y-%m-%d %H:%M')

@@ -25,7 +25,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
-from calib_ros.shown import counted, of_them, rounded, some
+from calib_ros.shown import counted, moment, of_them, rounded, some
 
 WEAK = Settings.largest_error
 """Standard deviation [m or rad] beyond which a parameter is named as weakly determined: an arm
@@ -144,11 +144,8 @@ def in_part(result: Identification) -> str:
 
 
 def _named(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
-    seconds = {each: divmod(each.stamp_ns, 10**9) for each in outliers}
     largest = sorted(outliers, key=lambda each: -each.size)
-    words = (
-        f'pose {numbers[each]} ({seconds[each][0]}.{seconds[each][1]:09d})' for each in largest
-    )
+    words = (f'pose {numbers[each]} ({moment(each.stamp_ns)})' for each in largest)
     return ', '.join(some([*dict.fromkeys(words)]))
 
 

@@ -21,6 +21,7 @@ from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report import explorer
 from calib_ros.report.page import render
+from calib_ros.shown import moment
 
 pytestmark = pytest.mark.skipif(
     browser_path() is None and 'CI' not in os.environ,
@@ -346,7 +347,9 @@ def test_many_refused_poses_on_a_telephone(chromium, tmp_path, monkeypatch):
     monkeypatch.setattr(explorer, 'SINGLE', 30)
     rows = measured(chain=load_chain('ur5e'), count=40)
     noise = np.random.default_rng(3).normal(0, 1e-3, (40, 3))
-    problem = Problem(load_chain('ur5e'), replace(rows, positions=rows.positions + noise))
+    stamps = 1_760_432_012_034_500_000 + rows.stamps_ns
+    rows = replace(rows, positions=rows.positions + noise, stamps_ns=stamps)
+    problem = Problem(load_chain('ur5e'), rows)
     found = identify(problem)
     assert not found.accepted
     found = replace(found, refusals=(Reason(Rule.EXCITATION, 'wrist_2_joint stood still'),))
@@ -364,6 +367,8 @@ def test_many_refused_poses_on_a_telephone(chromium, tmp_path, monkeypatch):
     assert 0 < len(cells) <= 40
     bands = page.evaluate("document.getElementById('session').data.map((t) => t.fill)")
     assert bands.count('tonexty') == 2
+    shown = page.inner_text('#rows tbody tr:first-child td:nth-child(2)')
+    assert shown in map(moment, stamps.tolist())
     page.locator('#rows tbody button').last.click()
     assert 'Picked' in page.inner_text('#picked')
     assert printed_height(page) < 1016

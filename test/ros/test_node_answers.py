@@ -30,6 +30,7 @@ from calib_ros.sampling.hints import apart
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.session import too_few
 from calib_ros.sampling.sources import STANDARD
+from calib_ros.shown import moment
 
 
 def test_errors_are_answers(cell, recording):
@@ -372,8 +373,7 @@ def test_outliers_are_named_by_number_and_stamp(cell, recording):
         message.pose.position.z += 0.02
     cell.play(topics(recording, measured_pose=some))
     answer = cell.done('identify')
-    sample = cell.node.session.samples[6]
-    stamp = f'{sample.stamp_ns // 10**9}.{sample.stamp_ns % 10**9:09d}'
+    stamp = moment(cell.node.session.samples[6].stamp_ns)
     assert f'1 outlier carries little or no weight: pose 7 ({stamp})' in cell.in_full(answer)
 
 

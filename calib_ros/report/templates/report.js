@@ -68,8 +68,10 @@
   const number = (i) => (e.number ? e.number[i] : i + 1);
   const source = (i) => {
     if (e.images[i]) return e.images[i];
-    const seconds = String(stamps[i] / 1000000000n);
-    return e.lines ? 'line ' + seconds : `${seconds}.${String(stamps[i] % 1000000000n).padStart(9, '0')} s`;
+    if (e.lines) return 'line ' + stamps[i] / 1000000000n;
+    const ms = Number(stamps[i] / 1000000n);
+    if (!e.clock) return `${(ms / 1000).toFixed(3)} s`;
+    return new Date(ms).toISOString().replace('T', ' ').replace('Z', ' UTC');
   };
   const triple = (name, i) => [...floats[name].subarray(3 * i, 3 * i + 3)];
   const length = (v) => Math.hypot(v[0], v[1], v[2]);
