@@ -120,7 +120,7 @@ def named_by_option(
     ours = (*names, *COVARIANCE) if fewer else ()  # q1 to q4 may be a quaternion
     like = like_joints([name for name in header if name not in ours], joints) if lacking else {}
     fewer = fewer and not like
-    more = '; joint values in another file: --joints FILE' if whole and not like else ''
+    more = '; joint values in another file or sheet: --joints FILE' if whole and not like else ''
     found = dict.fromkeys([name for name in missing if name not in lacking], 'NAME')
     found |= positions_in(header, [name for name in POSITION if name in missing])
     if more and called:
@@ -135,6 +135,8 @@ def named_by_option(
             found |= quaternions_in(header, sure=False)
         elif wire := distance_in(header):
             found = {n: each for n, each in found.items() if n not in POSITION} | wire
+        elif joints and not lacking:
+            more = '; are they in another file or sheet? Give that one, and this as --joints'
     # X_in is not read as a unit
     if (unit := words_of(found.get('x', ''))[1:]) in (['m'], ['in'], ['ft']):
         more = f' --length {unit[0]}{more}'

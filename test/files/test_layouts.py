@@ -87,7 +87,7 @@ def test_what_is_no_expression(text):
         ),
         (
             ['x', 'y', 'z', 'a', 'b'],
-            '--columns "q*=NAME*"; joint values in another file: --joints FILE',
+            '--columns "q*=NAME*"; joint values in another file or sheet: --joints FILE',
         ),
         (
             ['q1', 'c11', 'c12', 'y', 'z'],
@@ -100,7 +100,11 @@ def test_what_is_no_expression(text):
         (['j_0', 'j_1', 'x', 'y', 'z'], '--columns "q1=j_0,q2=j_1"'),
         (
             ['a', 'a', 'x', 'y', 'z'],
-            '--columns "q*=NAME*"; joint values in another file: --joints FILE',
+            '--columns "q*=NAME*"; joint values in another file or sheet: --joints FILE',
+        ),
+        (
+            ['q1', 'q2', 'Date', 'Load', 'Note'],
+            'are they in another file or sheet? Give that one, and this as --joints',
         ),
         (['0.1', '-2', '3', '4e-5', '5'], '--columns "q1=#1,q2=#2,x=#3,y=#4,z=#5", in its order'),
     ],
