@@ -7,6 +7,7 @@ docs/model.md (Judgement) lists and explains them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.configurations import STILL
+from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, CONFIDENT, MOST_OUTLIERS
 from calib_ros.estimation.problem import Problem
@@ -81,9 +83,18 @@ def _of_the_fit(
         yield Reason(Rule.EXCITATION, f'{_together(problem)}the poses do not determine {named}')
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
-        far = some([f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond])
+        far = some([f'{p.name} by {_far(p, problem.largest_angle)}' for p in beyond])
         text = f'off by more than even a faulty robot of this kind: {", ".join(far)}'
         yield Reason(Rule.COMMON_SENSE, text)
+
+
+def _far(parameter: ParameterRow, largest: float) -> str:
+    """Return an offset beyond the largest one [rad]; angles without whole turns, in degrees."""
+    offset = parameter.offset
+    if parameter.name.is_length:
+        return f'{1e3 * offset:.0f} mm'
+    turned = math.remainder(offset, math.tau)
+    return f'{math.degrees(turned if abs(turned) > largest else offset):.3g}°'
 
 
 def _together(problem: Problem) -> str:

@@ -114,6 +114,17 @@ def test_parameters_of_a_fit_that_explains_nothing_are_told_last(rng, before, af
     assert str(found[rules.index(Rule.COMMON_SENSE)]).endswith('kind: elbow_joint.a by 1500 mm')
 
 
+@pytest.mark.parametrize(
+    ('offset', 'text'), [(-7.670, '-79.5°'), (1.385, '79.4°'), (6.283, '360°')]
+)
+def test_angles_far_off_are_told_without_whole_turns(rng, offset, text):
+    """A zero left out of a DH table was told as -7670 mrad."""
+    away = rng.normal(size=(40, 3))
+    given = {'parameters': [row('theta', offset, 0.01)]}
+    found = refused(3e-3 * away, 1e-3 * away, np.ones(40, dtype=bool), **given)
+    assert str(found[0]).endswith(f'elbow_joint.theta by {text}')
+
+
 @pytest.mark.parametrize('size', [2e-3, 5e-3, 5e-2])
 def test_outliers_that_the_correction_causes_are_no_gross_errors(rng, size):
     judged = np.arange(40) >= 10
