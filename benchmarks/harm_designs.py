@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 
 NOISE = (5e-5, 2e-4)
@@ -29,6 +30,7 @@ ERRORS = {  # lengths [m], angles [rad]
 }
 SIZES = ('usual', 'large', 'small', 'none')
 ORDERS = ('random', 'path', 'sweeps')
+NEAR = (*ORDERS, 'local')
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,10 @@ DESIGNS = (
         counts=(40, 60, 80, 120),
     ),
     *(
+        Design(f'{frame} held off by 1 mm', 80, NEAR, what=f'held {frame}', size=1e-3)
+        for frame in ('base', 'tool')
+    ),
+    *(
         Design(f'slip of {size} degrees', 72, ORDERS, what='slip', size=size * np.pi / 180.0)
         for size in (0.02, 0.1, 0.5)
     ),
@@ -100,7 +106,7 @@ DESIGNS = (
         for how, size in (('', 0.0), (', to 1 mrad', 1e-3))
     ),
     *(
-        Design(f'device off by {1e3 * size:g} mm', 40, (*ORDERS, 'local'), what='bent', size=size)
+        Design(f'device off by {1e3 * size:g} mm', 40, NEAR, what='bent', size=size)
         for size in (1e-4, 3e-4, 1e-3)
     ),
     Design('scale of 500 ppm', 40, what='scale', size=5e-4),
@@ -162,6 +168,9 @@ def session(design, number):
         q = q + rng.normal(scale=design.size, size=q.shape)
     measured, problem = measured_by(design, arm, q, rng)
     chain = load_chain(robot)
+    if design.what.startswith('held'):
+        frame = design.what.removeprefix('held ')
+        chain = chain.with_frame(frame, stated(getattr(nominal, frame), design.size, rng))
     healthy = errors == 'none' and bend in ('', 'ripple') and design.what != 'slip'
     return Session(chain, nominal, measured, problem(chain), order, errors, healthy)
 
@@ -215,6 +224,15 @@ def measured_by(design, arm, q, rng):
     if what == 'rounded':
         seen = replace(seen, joints=np.round(seen.joints, 3))
     return arm, lambda chain: Problem(chain, seen, **options)
+
+
+def stated(frame, size, rng):
+    """Return a frame (rotation, position) as known, but off by so much (RMS) [m, rad]."""
+    shift, turn = rng.normal(scale=size / np.sqrt(3.0), size=(2, 3))
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ frame[0]
+    matrix[:3, 3] = frame[1] + shift
+    return Frame(matrix, fixed=True)
 
 
 def observed(arm, q, rng, oriented, shift=0.0):

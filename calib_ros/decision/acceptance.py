@@ -164,6 +164,11 @@ def _of_the_gain(
                 '; measure something that fixes the size and shape of the arm: positions, or two '
                 'sockets a known distance apart'
             )
+        if held := [key for key in problem.model.frame_names if problem.model.frame(key).fixed]:
+            text += (
+                f'; if the {" or ".join(held)} held by the chain file may be off, remove fixed: '
+                'true there'
+            )
         yield Reason(Rule.REGION, text)
 
 

@@ -20,8 +20,6 @@ from calib_ros.estimation.levels import NEARER, SURE
 from calib_ros.estimation.sizes import TYPICAL, Evidence
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
-MOVE = TYPICAL['angle']
-"""Size [m, rad] of the moves of a frame, within a factor of ten (assumed)."""
 LEAST = float(special.logit(SURE))
 """Log odds, for as many possible moves as there are, from which one is named."""
 
@@ -60,7 +58,7 @@ class Imitation:
         """
         cross, vector = self._about_nominal(products)
         along = cross @ self._root
-        whole = own / self._variance + MOVE**-2.0 * np.eye(own.shape[-1])
+        whole = own / self._variance + TYPICAL['frame'] ** -2.0 * np.eye(own.shape[-1])
         left = whole - along @ np.swapaxes(along, 1, 2)
         root = inverse_root(left, np.diagonal(whole, axis1=1, axis2=2))
         spared = np.einsum('bkj,bk->bj', root, vector - along @ self._fit)
@@ -74,9 +72,9 @@ class Imitation:
         cross, vector = self._about_nominal(products)
         matrix = np.block([[self._matrix, cross.T], [cross, own / self._variance]])
         given = np.append(self._given, np.zeros(len(cross)))
-        groups, typical = [*self._groups, *['moved'] * len(cross)], TYPICAL | {'moved': MOVE}
+        groups = [*self._groups, *['frame'] * len(cross)]
         still = Evidence(self._matrix, self._vector, self._given, self._groups, TYPICAL)
-        moved = Evidence(matrix, np.append(self._vector, vector), given, groups, typical)
+        moved = Evidence(matrix, np.append(self._vector, vector), given, groups, TYPICAL)
         odds, mean, _ = moved.against(still, still.most_probable(set())[0], set())
         found, size = np.split(mean, [len(self._offsets)])
         off, far = (self._distance(each) for each in (self._offsets - found, found))

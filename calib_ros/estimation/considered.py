@@ -39,14 +39,21 @@ CONSIDERED = ('eccentricity', 'gravity')
 def considered(chain: Chain, names: Sequence[str], fixed: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the effects that an arm may have besides the named ones.
 
-    DH parameters held at nominal by a `fixed` pattern may be off as well.
+    DH parameters held at nominal by a `fixed` pattern may be off as well, and frames held by the
+    chain file.
     """
     every = [name for group in CONSIDERED for name in effects.members(chain, group)]
     every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
     held = {n for each in fixed for n in fnmatch.filter(chain.parameter_names, each)}
     every += [name for name in chain.parameter_names if name in held and name.of_dh]
-    every += lenses(chain)
+    every += [*lenses(chain), *held_frames(chain)]
     return tuple(name for name in every if name not in names)
+
+
+def held_frames(chain: Chain) -> list[Parameter]:
+    """Return the parameters of the frames that the chain file holds."""
+    held = [key for key in chain.frame_names if chain.frame(key).fixed]
+    return [name for key in held for name in parameters_of(key)]
 
 
 def lenses(chain: Chain) -> dict[Parameter, float]:

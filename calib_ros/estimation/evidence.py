@@ -26,7 +26,14 @@ from typing import TypeAlias
 import numpy as np
 from scipy import special
 
-from calib_ros.estimation.considered import Doubted, Doubts, doubted_products, lengths_of, lenses
+from calib_ros.estimation.considered import (
+    Doubted,
+    Doubts,
+    doubted_products,
+    held_frames,
+    lengths_of,
+    lenses,
+)
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.levels import CONFIDENT, OUT_OF_SCALE, PRINTED, SCALE, UNUSUAL
@@ -43,8 +50,10 @@ Mixed: TypeAlias = tuple[float, FloatArray, FloatArray]
 
 
 def size_group(chain: Chain, name: str) -> str | None:
-    """Return the group of parameters with errors of one size; None for frames."""
-    return None if chain.owns_frame(name) else _group(name)
+    """Return the group of parameters with errors of one size; None for unknown frames."""
+    if chain.owns_frame(name):
+        return 'frame' if name in held_frames(chain) else None
+    return _group(name)
 
 
 @lru_cache(maxsize=1024)

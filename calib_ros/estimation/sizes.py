@@ -14,9 +14,15 @@ from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.kinematics.effects import EXPECTED
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 
-TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': EXPECTED['gear'], 'coupling': 1e-3}
+TYPICAL = {
+    'length': 5e-4,
+    'angle': 1e-3,
+    'drive': EXPECTED['gear'],
+    'coupling': 1e-3,
+    'frame': 1e-3,
+}
 TYPICAL |= {group: EXPECTED[group] for group in ('gravity', 'compliance', 'backlash')}
-"""Size [m, rad] of the errors that arms have, by group."""
+"""Size [m, rad] of the errors that arms, and frames said to be known, have, by group."""
 SPREAD = 10.0
 """Factor between the error sizes of one arm and TYPICAL (one standard deviation;
 benchmarks/harm.py)."""

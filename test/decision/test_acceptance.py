@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import SCARA, SIGMAS, UR10E, measured_arm
+from fits import NOISE, SCARA, SIGMAS, UR10E, measured_arm
 from scipy import stats
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -19,6 +19,7 @@ from calib_ros.estimation.levels import CERTAIN
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.parameter import FRAME_KINDS
 
 pytestmark = pytest.mark.usefixtures('unsearched')
 
@@ -215,3 +216,23 @@ def test_rows_in_another_order_do_not_look_like_the_wrong_arm(seed):
     rules = [each.rule for each in result.refusals]
     assert rules[0] is Rule.LARGEST_ERROR
     assert Rule.COMMON_SENSE not in rules[:-1]
+
+
+@pytest.mark.parametrize('kind', ['base', 'tool'])
+def test_an_arm_does_not_make_up_for_a_frame_held_a_little_off(kind):
+    """An arm without errors, moved joint by joint; the message says what to do."""
+    told, chain = 0, load_chain('kuka_iiwa14')
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        true = replace(chain, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
+        moves = np.kron(np.eye(7), np.linspace(-1.0, 1.0, 13)[:, np.newaxis])
+        q = 0.5 * chain.random_joints(1, rng) + rng.permutation(moves)
+        seen = measure(true, q, rng, *NOISE)
+        frame, (shift, turn) = getattr(true, kind), rng.normal(scale=6e-4, size=(2, 3))
+        off = dict(zip(FRAME_KINDS, (*shift, *turn), strict=True))
+        held = replace(chain, **{kind: replace(frame.moved(off), fixed=True)})
+        result = identify(Problem(held, seen, **SIGMAS))
+        assert not result.accepted
+        text = f'if the {kind} held by the chain file may be off, remove fixed: true there'
+        told += any(text in each for each in result.refusals)
+    assert told >= 3
