@@ -284,21 +284,26 @@ def csv_blocks(
         while length_hint(end):
             before = line
             some = islice(reader, MOST_ENTRIES // width + 1 if width else 1)  # fits the caches
-            block = [(above + line, row) for row in some if (line := reader.line_num) and any(row)]
-            widths = [width, *(len(row) for _, row in block)]
-            of_several = block if line - before > len(block) else []  # or with blank lines
-            for cells, (last, row) in zip(widths, of_several, strict=False):
-                within = re.split('\r\n?|\n', separator.join(row))  # lines, as csv has them
-                if len(within) > 1 < cells and {w.count(separator) for w in within} == {cells - 1}:
-                    line = last - above - len(within)
+            rows = [(line, row) for row in some if (line := reader.line_num)]
+            ends = [before, *(last for last, _ in rows)]
+            widths = [len(row) for _, row in rows]
+            for first, (last, row) in zip(
+                ends, rows if line - before > len(rows) else (), strict=False
+            ):
+                within = (
+                    re.split('\r\n?|\n', separator.join(row)) if last - first > 1 < width else ()
+                )
+                if {part.count(separator) for part in within} == {width - 1}:  # a note has others
+                    line = first
                     raise csv.Error('whole rows are within quotation marks')
-            if max(widths) > MOST_ENTRIES:
+                width = len(row) or width
+            if max(widths, default=0) > MOST_ENTRIES:
                 raise InputError(f'{path} has {max(widths)} columns, more than {MOST_ENTRIES}')
-            if block and block[-1][0] == above + line and not length_hint(end):
-                line = block[-2][0] - above if len(block) > 1 else before
+            if rows and rows[-1][1] and not length_hint(end):
+                line = ends[-2]
                 raise csv.Error('unexpected end of data')
-            if block:
-                width = widths[-1]
+            width = next(filter(None, reversed(widths)), width)
+            if block := [(above + last, row) for last, row in rows if any(row)]:
                 yield block
     except csv.Error as err:
         raise (InputError if line else ColumnsError)(  # other separators may suit the header
