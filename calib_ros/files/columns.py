@@ -277,32 +277,21 @@ def csv_blocks(
         )
     as_text(data, str(path), ColumnsError)
     end = iter(['\n'])  # no row, unless a quotation mark is open
-    lines = chain(csv_lines(data, str(path)), end)
-    reader = csv.reader(lines, delimiter=separator, strict=strict)
-    line = width = 0
+    reader = csv.reader(chain(csv_lines(data, str(path)), end), delimiter=separator, strict=strict)
+    before = line = width = 0
     try:
         while length_hint(end):
-            before = line
             some = islice(reader, MOST_ENTRIES // width + 1 if width else 1)  # fits the caches
             rows = [(line, row) for row in some if (line := reader.line_num)]
-            ends = [before, *(last for last, _ in rows)]
-            widths = [len(row) for _, row in rows]
-            for first, (last, row) in zip(
-                ends, rows if line - before > len(rows) else (), strict=False
-            ):
-                within = (
-                    re.split('\r\n?|\n', separator.join(row)) if last - first > 1 < width else ()
-                )
-                if {part.count(separator) for part in within} == {width - 1}:  # a note has others
-                    line = first
-                    raise csv.Error('whole rows are within quotation marks')
-                width = len(row) or width
-            if max(widths, default=0) > MOST_ENTRIES:
-                raise InputError(f'{path} has {max(widths)} columns, more than {MOST_ENTRIES}')
+            if line - before > len(rows) and (at := _quoted(rows, before, width, separator)) >= 0:
+                line = at
+                raise csv.Error('whole rows are within quotation marks')
             if rows and rows[-1][1] and not length_hint(end):
-                line = ends[-2]
+                line = rows[-2][0] if len(rows) > 1 else before
                 raise csv.Error('unexpected end of data')
-            width = next(filter(None, reversed(widths)), width)
+            if (most := max((len(row) for _, row in rows), default=0)) > MOST_ENTRIES:
+                raise InputError(f'{path} has {most} columns, more than {MOST_ENTRIES}')
+            width, before = next((len(row) for _, row in reversed(rows) if row), width), line
             if block := [(above + last, row) for last, row in rows if any(row)]:
                 yield block
     except csv.Error as err:
@@ -310,6 +299,19 @@ def csv_blocks(
             f'cannot read {path} from line {above + line + 1}: {err}: are its quotation marks '
             'paired?'
         ) from err
+
+
+def _quoted(rows: Iterable[Cells], before: int, width: int, separator: str) -> int:
+    """Return the line before a row that holds whole rows within quotation marks, or -1.
+
+    `before` is the line at which the row before them ends, `width` how many cells it has.
+    """
+    for line, row in rows:
+        within = re.split('\r\n?|\n', separator.join(row)) if line - before > 1 < width else ()
+        if {part.count(separator) for part in within} == {width - 1}:  # a note has others
+            return before
+        before, width = line, len(row) or width
+    return -1
 
 
 def _numbers(text: str, decimal: str = '.') -> FloatArray:

@@ -76,14 +76,17 @@ def test_rows_that_name_the_joints_are_no_header_of_numbered_columns(tmp_path):
         ('1,2,3,4,5,"\n1,2,3,4,6', '.* quotation marks paired'),
         ('1,2,3,4,5,"\n1,2,3,4,6,\n1,2,3,4,7,"', 'whole rows are within quotation marks'),
         ('1,2,3,4,5,"\n1,2,3,4,6,\n1,2,3,4,",', 'whole rows are within quotation marks'),
+        (',,,,,\n"1,2,3,4,5,\n1,2,3,4,6,"', 'whole rows are within quotation marks'),
+        ('\n"1,2,3,4,5,\n1,2,3,4,6,"', 'whole rows are within quotation marks'),
     ],
 )
 def test_a_quotation_mark_hides_no_rows(tmp_path, rows, said):
     """Those below an open one, or between two ditto marks, were one cell that nobody reads."""
     path = tmp_path / 'cell.csv'
     path.write_text(f'q1,q2,x,y,z,note\n1,2,3,4,5,a\n{rows}\n')
+    line = 3 if rows.startswith('1') else 4
     for foreign in (None, Foreign(Layout())):
-        with pytest.raises(InputError, match=f'from line 3: {said}'):
+        with pytest.raises(InputError, match=f'from line {line}: {said}'):
             read_table(path, 2, foreign=foreign)
 
 
