@@ -9,8 +9,9 @@ import sys
 import pytest
 
 SLOW = """
-import importlib, time
+import importlib, signal, time
 from calib_ros import start
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in a background job
 def slow(name):
     print(name, flush=True)
     time.sleep(600.0)

@@ -85,14 +85,16 @@ class Explained:
 def with_mistake(problem: Problem, result: Identification) -> Identification:
     """Return the result with the mistake that explains its errors, if any.
 
-    It becomes the first refusal, in place of a held frame found wrong by the misfit; but another
-    arm, and orientations that do not fit, only give a remark if nothing else refuses the result.
+    It becomes the first refusal, in place of those that follow from it with the same advice: a
+    held frame found wrong by the misfit, or no gain beyond the uncertainty. But another arm, and
+    orientations that do not fit, only give a remark if nothing else refuses the result.
     """
     found = explained(problem) if _suspicious(problem, result) else None
     if found is None:
         return result
     if result.refusals or found.alone:
-        others = (each for each in result.refusals if each.rule is not Rule.MISTAKE)
+        follow = (Rule.MISTAKE, Rule.REGION)
+        others = (each for each in result.refusals if each.rule not in follow)
         return replace(result, refusals=(found.reason, *others))
     return replace(result, remarks=(str(found), *result.remarks))
 

@@ -52,7 +52,7 @@ def test_robots_with_what_their_group_says(tmp_path):
         ('sigma_position', 'sigma_positoin', r'robot 1 .*did you mean "sigma_position"'),
         ('tolerance: 0.3', 'tolerence: 0.3', r'group weld.*did you mean "tolerance"'),
         ('session: A', 'sesion: A', r'robot 2 \(B\).*did you mean "session"'),
-        ('chain: ur10e', 'chain: ur10f', r'robot 1 \(0042\).*did you mean "ur10'),
+        ('chain: ur10e', 'chain: ur10f', r'robot 1 \(0042\).*needs a URDF or a chain'),
         ('robots:', 'robot:', r'did you mean "robots"'),
         ('"0042"', '0042', r'robot 1: serial must be text'),
         ('serial: B', 'serial: "0042"', r'two robots with the serial 0042'),
