@@ -70,12 +70,22 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
             raise UnknownNameError('robot', str(name_or_path), robots, another)
         path = robots[name]
     chain = parse_chain(chain_text(path), str(path))
-    _refuse_degrees(chain, str(path))
+    _refuse_other_units(chain, str(path))
     return chain
 
 
-def _refuse_degrees(chain: Chain, where: str) -> None:
-    """Refuse limits in degrees, between which joint values in degrees would pass for radians."""
+def _refuse_other_units(chain: Chain, where: str) -> None:
+    """Refuse limits in degrees and lengths in millimetres.
+
+    Joint values in degrees would pass for radians between such limits, and plans and programs have
+    no measured lengths to compare.
+    """
+    free = chain.parallel or ()  # whose d may be anything
+    length = sum(np.hypot(j.a, 0.0 if j.name in free else j.d) for j in chain.joints)
+    if length > 100.0:  # 0.1 m in mm: no arm is smaller, and none as long
+        raise ConfigError(
+            f'{where}: its links are {length:.0f} m long: lengths must be in metres, 300 mm as 0.3'
+        )
     for k, joint in enumerate(chain.joints, 1):
         for key in ('lower', 'upper') if joint.type == 'revolute' else ():
             limit = float(getattr(joint, key) or 0.0)
@@ -94,7 +104,7 @@ def read_urdf(
 ) -> Chain:
     """Read the chain between two links of a URDF, with its frames (`urdf.chain_from_urdf`)."""
     chain = chain_from_urdf(chain_text(path), base_link, tip_link, convention)
-    _refuse_degrees(chain, str(path))
+    _refuse_other_units(chain, str(path))
     return chain
 
 

@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import re
 from pathlib import Path
 
 import numpy as np
@@ -308,3 +309,22 @@ def test_limits_in_degrees_are_refused(tmp_path, name, text):
         ConfigError, match=r'joint 1: lower must be in radians, not -360: .*-6.283'
     ):
         load_chain(tmp_path / name)
+
+
+@pytest.mark.parametrize('name', ['cell.yaml', 'cell.urdf'])
+def test_lengths_in_millimetres_are_refused(tmp_path, name):
+    """A plan for an arm of 1,700 m asked for six poses."""
+    text = UR if name == 'cell.yaml' else ur10e()
+    length = r'(?<= [ad]: )-?[\d.]+|(?<=xyz=")[^"]+'
+    text = re.sub(length, lambda m: ' '.join(f'{1e3 * float(x):g}' for x in m[0].split()), text)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ConfigError, match=r'its links are 1\d\d\d m long: .* 300 mm as 0.3'):
+        load_chain(tmp_path / name)
+
+
+def test_a_large_d_between_parallel_axes_is_no_length_in_millimetres(tmp_path):
+    """As in controllers' own calibrations: the arm is as long as ever."""
+    text = UR.replace('a: -0.612, alpha: 0.0, d: 0.0', 'a: -0.612, alpha: 0.0, d: 439.0')
+    text = text.replace('a: -0.5723, alpha: 0.0, d: 0.0', 'a: -0.5723, alpha: 0.0, d: -439.0')
+    (tmp_path / 'cell.yaml').write_text(text)
+    assert load_chain(tmp_path / 'cell.yaml').joints[1].d == 439.0
