@@ -164,7 +164,8 @@ def _of_the_gain(
                 '; measure something that fixes the size and shape of the arm: positions, or two '
                 'sockets a known distance apart'
             )
-        if held := [key for key in problem.model.frame_names if problem.model.frame(key).fixed]:
+        used = dict.fromkeys(key for each in problem.sets for key in (each.base, each.tool))
+        if held := [key for key in used if problem.model.frame(key).fixed]:
             text += (
                 f'; if the {" or ".join(held)} held by the chain file may be off, remove fixed: '
                 'true there'

@@ -47,14 +47,16 @@ class Units:
         main = [name for name in turns if name[0] == 'q']
         given: dict[str, str] = {name: getattr(layout, name) for name in layout.insisted}
         angle = given.get('angle', '')
+        known = angle or given.get('joint_angle', '')
         usual = self._in_words(
-            'angles', ANGLES, layout.angle, angle or given.get('joint_angle', '')
+            'angles', ANGLES, layout.angle, known, (*turns, *TURNS, *IN_TURN, *SIGMAS[3:])
         )
         length = given.get('length', '')
+        lengths = *POSITION, 'distance', *slides, *SIGMAS[:3]
         found = self._told(
             'length',
             length,
-            self._in_words('lengths', LENGTHS, layout.length, length),
+            self._in_words('lengths', LENGTHS, layout.length, length, lengths),
             (*POSITION, 'distance'),
             (*slides, *SIGMAS[:3]),
         )
@@ -72,10 +74,18 @@ class Units:
         if self._assumed:
             self.notes.append(f'no units are given: taking {", ".join(self._assumed)}')
 
-    def _in_words(self, what: str, units: Mapping[str, float], usual: str, given: str) -> str:
+    def _in_words(
+        self,
+        what: str,
+        units: Mapping[str, float],
+        usual: str,
+        given: str,
+        columns: Sequence[str],
+    ) -> str:
         """Return the one of some units that lines of words tell, or the usual one.
 
-        Lines that tell several are refused, unless one is given.
+        Lines that tell several are refused, unless one is given or each of our columns of this
+        kind has its own.
         """
         found = [words for line in self._sheet.words for words in UNITS_ARE.findall(line)]
         known = [[UNIT_SIGNS.get(word.lower(), '') for word in words] for words in found]
@@ -84,7 +94,8 @@ class Units:
             for words in known
             if (ours := [unit for unit in words if unit in units])
         )
-        if len(told) > 1 and not given:
+        bare = any(not self._said(name) for name in columns if name in self._columns)
+        if len(told) > 1 and not given and bare:
             raise InputError(
                 f'{self._sheet.path}: {what} are in {" and ".join(told)}, as its lines of units '
                 f'say: split the file there, or give --{what.removesuffix("s")} if one holds'

@@ -80,8 +80,8 @@ def _refuse_other_units(chain: Chain, where: str) -> None:
     Joint values in degrees would pass for radians between such limits, and plans and programs have
     no measured lengths to compare.
     """
-    free = chain.parallel or ()  # whose d may be anything
-    length = sum(np.hypot(j.a, 0.0 if j.name in free else j.d) for j in chain.joints)
+    along = sum(each.d for each in chain.joints)  # parallel axes share any d, with signs
+    length = sum(abs(each.a) for each in chain.joints) + abs(along)
     if length > 100.0:  # 0.1 m in mm: no arm is smaller, and none as long
         raise ConfigError(
             f'{where}: its links are {length:.0f} m long: lengths must be in metres, 300 mm as 0.3'

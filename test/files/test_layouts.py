@@ -259,3 +259,18 @@ def test_names_of_poses_need_no_column_of_the_same_name(tmp_path, points, log, o
         return
     (found,) = read_table(tmp_path / 'points.csv', 1, foreign=given).fitted
     assert found.joints[:, 0].tolist() == found.positions[:, 0].tolist()
+
+
+@pytest.mark.parametrize(('names', 'refused'), [('q1,q2,x,y,z', True), (None, False)])
+def test_lines_of_several_units_are_refused_unless_each_column_has_its_own(
+    tmp_path, names, refused
+):
+    """Two files in one were read in the units of the first."""
+    path = tmp_path / 'cell.csv'
+    units = 'q1 [rad],q2 [rad],x [m],y [m],z [m]'
+    path.write_text(f'Units: mm\n{names or units}\n0,0,1,2,3\n0,1,1,2,4\nUnits: m\n1,0,2,3,4\n')
+    if refused:
+        with pytest.raises(InputError, match=r'lengths are in mm and m, .* give --length if one'):
+            read_table(path, 2, foreign=Foreign(Layout()))
+    else:
+        assert read_table(path, 2, foreign=Foreign(Layout())).fitted[0].positions[0, 2] == 3.0

@@ -324,7 +324,8 @@ def test_lengths_in_millimetres_are_refused(tmp_path, name):
 
 def test_a_large_d_between_parallel_axes_is_no_length_in_millimetres(tmp_path):
     """As in controllers' own calibrations: the arm is as long as ever."""
-    text = UR.replace('a: -0.612, alpha: 0.0, d: 0.0', 'a: -0.612, alpha: 0.0, d: 439.0')
-    text = text.replace('a: -0.5723, alpha: 0.0, d: 0.0', 'a: -0.5723, alpha: 0.0, d: -439.0')
+    text = UR.replace('alpha: 0.0, d: 0.0,', 'alpha: 0.0, d: 439.0,', 1)
+    text = text.replace('alpha: 0.0, d: 0.0,', 'alpha: 0.0, d: -308.0,')
+    text = text.replace('d: 0.163941', 'd: -130.836059')
     (tmp_path / 'cell.yaml').write_text(text)
     assert load_chain(tmp_path / 'cell.yaml').joints[1].d == 439.0
