@@ -172,7 +172,7 @@ from calib_ros.ros import node
 node.JOIN_TIMEOUT = 0.1
 def slow(*given):
     print('rendering', flush=True)
-    time.sleep(1.0)
+    time.sleep(4.0)
     return '<html>'
 page.render = slow
 """
