@@ -17,10 +17,11 @@ def node() -> int:
 
 
 def _run(name: str) -> int:
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:  # else it is ignored, as of a background job
+    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # a background job: none
+    if usual:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     module = importlib.import_module(name)
-    signal.signal(signal.SIGINT, before)
+    if usual:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     status: int = module.main()
     return status

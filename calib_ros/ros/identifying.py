@@ -131,10 +131,10 @@ class Identifying:
     def snapshot(self, inputs: Inputs) -> Snapshot:
         """Return the current problem and its context."""
         session, self._advice, self._report = self._session, '', None
-        self.earlier = ONE_BEFORE
         try:
             problem = session.problem()
         except InputError as err:
+            self.earlier = ONE_BEFORE
             why = [] if session.samples else inputs.failures
             raise InputError('; '.join((*why, str(err)))) from err
         samples = tuple(session.usable)
@@ -162,8 +162,13 @@ class Identifying:
         """Identify; publish only an accepted result."""
         loaded, settings = given.loaded, given.settings
         self._advice = next(iter(loaded.warnings), '')  # if poses are too few
-        with self.progress.running():
-            result = loaded.identified(settings.model, self.progress)
+        try:
+            with self.progress.running():
+                result = loaded.identified(settings.model, self.progress)
+        except Exception:
+            self.earlier = ONE_BEFORE
+            raise
+        self.earlier = '' if result.accepted else ONE_BEFORE
         steps = (step for reason in advice_of(result) for step in reason.steps)
         telling = next((each.short for each in result.refusals if each.rule in TELLING_RULES), '')
         first = next(steps, '') if telling else given.cause or next(steps, '')
@@ -181,7 +186,6 @@ class Identifying:
             found = Calibration.of(result, given.origin, loaded.owners, loaded.problem.sets)
             published = Published(found.dump(), given.configuration, page)
             self._accepted(found, published, given.samples)
-            self.earlier = ''
             self.last += KEEP
         else:
             if self._session.calibration is not None:

@@ -20,6 +20,7 @@ from calib_ros.files.history import History
 from calib_ros.identification.identification import identify
 from calib_ros.ros.arguments import NODE
 from calib_ros.ros.boundary import InOrder
+from calib_ros.ros.identifying import ONE_BEFORE
 from calib_ros.ros.outputs import Keeper
 
 
@@ -71,6 +72,7 @@ def test_no_earlier_calibration_is_taken_for_the_one_that_is_identified(cell, re
     release.clear()
     running = cell.start_call('identify')
     cell.spin_until(lambda: len(problems) == 2)
+    assert ONE_BEFORE not in cell.call('validate').message  # what it gives is not known yet
     files = sorted(cell.node._archive.folder.iterdir())
     for name in ('save', 'export', 'load'):
         said = cell.refused(name).message
