@@ -13,6 +13,7 @@ from calib_ros.files.names import (
     NOMINAL_WORDS,
     distance_in,
     like_joints,
+    matrix_in,
     named_in,
     only_numbers,
     option,
@@ -133,8 +134,8 @@ def named_by_option(
     if {*POSITION} <= {*missing}:
         if found['x'] != 'NAME':
             found |= quaternions_in(header, sure=False)
-        elif wire := distance_in(header):
-            found = {n: each for n, each in found.items() if n not in POSITION} | wire
+        elif other := matrix_in(header) or distance_in(header):
+            found = {n: each for n, each in found.items() if n not in POSITION} | other
         elif joints and not lacking:
             more = '; are they in another file or sheet? Give that one, and this as --joints'
     # X_in is not read as a unit

@@ -9,10 +9,19 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 
-from calib_ros.files.vocabulary import IN_TURN, POSITION, QUATERNION, TURNS, joint_columns
+from calib_ros.files.vocabulary import (
+    IN_TURN,
+    MATRIX,
+    POSITION,
+    QUATERNION,
+    TURNS,
+    joint_columns,
+)
 
 WORD = re.compile(r'[^\W\d_A-Z]+|[A-Z][^\W\d_A-Z]+|[A-Z]+(?![a-z])|[0-9]+')
 """Words of a name: `X_meas`, `pose.position.x`, `dX`, `Nominal X`."""
+CORNER = re.compile(r'(\D*)([01])(\D*)\2(\D*)')
+"""The name of the first number of a matrix."""
 PLAIN = re.compile(r'#[\d*]+|[^\W\d][\w*]*(\.[\w*]+)*')
 """Names that --columns takes without braces."""
 
@@ -88,6 +97,22 @@ def positions_in(header: Sequence[str], missing: Sequence[str]) -> dict[str, str
     """Return the names of measured coordinates, never of nominal ones, if only some may be."""
     names = _one(groups(header, missing, without=NO_PLACE))
     return {} if in_doubt(header, names) else dict(zip(missing, names, strict=False))
+
+
+def matrix_in(header: Sequence[str]) -> dict[str, str]:
+    """Return the names of a pose as a homogeneous matrix: `m_00`, `T[1,1]`; never nominal ones."""
+    for name in header:
+        first = CORNER.fullmatch(name)
+        if first is None or {*words_of(name)} & (NOMINAL_WORDS | DEVIATION):
+            continue
+        before, start, between, after = first.groups()
+        rows, columns = (range(int(start), int(start) + count) for count in (3, 4))
+        names = [[f'{before}{i}{between}{j}{after}' for j in columns] for i in rows]
+        turned = [each for *three, _ in names for each in three]
+        places = [place for *_, place in names]
+        if {*turned, *places} <= {*header}:
+            return dict(zip((*POSITION, *MATRIX), (*places, *turned), strict=True))
+    return {}
 
 
 def quaternions_in(header: Sequence[str], sure: bool = True) -> dict[str, str]:

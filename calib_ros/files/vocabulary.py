@@ -24,7 +24,7 @@ UNIT_SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
 _ANY = '|'.join(UNIT_SIGNS)
 _WORDS = '|'.join(sign for sign in UNIT_SIGNS if sign not in ('m', 'in', 'ft'))
 UNIT = re.compile(
-    rf'(.*[^\s,/_]) *(?:[\[(](?![0-9]+[\])])([^\[\]()]+)[\])]|[,/] *({_ANY})|[-_ ]({_WORDS}))',
+    rf'(.*[^\s,/_]) *(?:[\[(](?![0-9,]+[\])])([^\[\]()]+)[\])]|[,/] *({_ANY})|[-_ ]({_WORDS}))',
     re.I,
 )
 """A name with its unit: X [mm], X (mm), X / mm, X_mm, X-mm; brackets may hold something else."""

@@ -197,6 +197,19 @@ def test_a_pose_of_ros_is_proposed(tmp_path, prefix):
     assert_same(proposed(path))
 
 
+@pytest.mark.parametrize('form', ['m_{}{}', 'T[{},{}]', 'pose{}_{}.measured'])
+@pytest.mark.parametrize('first', [0, 1])
+def test_a_homogeneous_matrix_is_proposed(tmp_path, form, first):
+    path, poses = tmp_path / 'cell.csv', np.tile(np.eye(4), (len(PLACES), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = TURNED.as_matrix(), PLACES
+    numbers = poses.reshape(-1, 16)
+    places = [(i + first, j + first) for i in range(4) for j in range(4)]
+    nominal = [f'nominal_{i}{j}' for i, j in places]
+    given = ['theta_1', 'theta_2', *nominal, *(form.format(*each) for each in places)]
+    path.write_text(text_of(JOINTS, numbers + 0.1, numbers, names=given, separator=';'))
+    assert_same(proposed(path))
+
+
 @pytest.mark.parametrize(
     ('angles', 'option'),
     [
