@@ -57,13 +57,18 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if chain.tool is None:
         place = ' '.join(f'{x:g}' for x in ASSUMED_TOOL)
         remarks.append(f'the tool is unknown: the target is assumed at {place} m from the flange')
+    ranges: dict[str, list[str]] = {}
     for joint in chain.joints if options.candidates is None else ():
-        if joint.guessed:
-            lower, upper = joint.range
-            remarks.append(
-                f'{joint.name} has no limits: it is planned from {lower:g} to {upper:g} m; give '
-                'its limits in the chain file (lower, upper)'
-            )
+        if None in (joint.lower, joint.upper):
+            turns = joint.type == 'revolute'
+            lower, upper = np.degrees(joint.range) if turns else joint.range
+            planned = f'from {lower:g} to {upper:g} {"degrees" if turns else "m"}'
+            ranges.setdefault(planned, []).append(joint.name)
+    for planned, names in ranges.items():
+        remarks.append(
+            f'without limits, planned {planned}: {", ".join(names)}; give the limits in the chain '
+            'file (lower, upper)'
+        )
     screen.say('\n'.join([*table, *remarks, *([VISIT] if plan is None else [])]))
     if options.out is not None:
         page = _page_beside(options.out)

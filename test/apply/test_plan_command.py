@@ -89,13 +89,17 @@ def test_plan_writes_joint_values_in_order_of_visit(run, tmp_path):
     assert (tmp_path / 'plan.csv').read_bytes() != before
 
 
-def test_plan_names_a_rail_without_limits(run, tmp_path):
+def test_plan_names_joints_without_limits(run, tmp_path):
     rail = load_chain('ur10e_on_linear_axis')
-    rail = replace(rail, joints=(replace(rail.joints[0], upper=None), *rail.joints[1:]))
+    first, turn, lift, *rest = rail.joints
+    turn, lift = replace(turn, lower=None, upper=None), replace(lift, lower=None)
+    rail = replace(rail, joints=(replace(first, upper=None), turn, lift, *rest))
     (tmp_path / 'rail.yaml').write_text(dump_chain(rail))
     _, said, _ = run('plan', '--chain', 'rail.yaml', '--poses', 10, '--draw', 50)
     assert said.endswith('- Nothing was saved: --out FILE writes the poses and a report\n')
-    assert 'linear_axis_joint has no limits: it is planned from 0 to 1 m; give' in said
+    assert 'without limits, planned from 0 to 1 m: linear_axis_joint; give' in said
+    assert f'planned from -180 to 180 degrees: {turn.name}' in said
+    assert f'planned from -180 to 360 degrees: {lift.name}' in said
 
 
 def test_plan_takes_candidates_task_and_poses_taken_from_files(run, tmp_path):
