@@ -200,8 +200,8 @@ def _in_parameters_of(
     chain = first.chain.with_effects(effects)
     other = second.chain
     frames = [name for end in ('base', 'tool') for name in parameters_of(end)]
-    every = [*first.names, *second.names, *effects]
-    arm = [Parameter(n) for n in dict.fromkeys(every) if not chain.owns_frame(n)]
+    every = dict.fromkeys((*first.names, *second.names, *effects))
+    arm = [Parameter(n) for n in every if not (chain.owns_frame(n) or other.owns_frame(n))]
     nominal = first.before.with_effects(effects)  # corrected axes are never quite parallel
     independent = structurally_independent(nominal, [*frames, *arm])
     names = tuple(Parameter(name) for name in independent if name in arm)

@@ -10,6 +10,7 @@ import pytest
 from fits import NOISE, SCARA, SIGMAS, UR10E as UR
 from measured import bent
 from robots import DATA, needs_data
+from scipy.linalg import block_diag
 
 from calib_ros import Calibration, Observations, Problem, difference, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -22,7 +23,7 @@ from calib_ros.decision.changes import (
 )
 from calib_ros.errors import InputError
 from calib_ros.identification.age import drift_of
-from calib_ros.kinematics.parameter import Parameter
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 
 UR10 = DATA / 'ur10_ipa_leica'
 
@@ -77,6 +78,19 @@ def test_an_arm_that_has_not_changed_is_the_same_wherever_the_device_stands(nigh
         assert found.limit < 1e-4
         assert found.left < 1e-7
         assert found.in_words().startswith('unchanged within 0.0')
+
+
+def test_another_night_may_have_more_devices_and_targets(nights):
+    true, first = nights
+    second = calibrated(true, 1)
+    chain = second.chain.with_frame('tool_2', second.chain.tool)
+    names = (*second.names, *parameters_of('tool_2'))
+    covariance = block_diag(second.covariance, 1e-8 * np.eye(6))
+    more = replace(second, chain=chain, names=names, covariance=covariance)
+    for pair in ((first, more), (more, first)):
+        found = difference(*pair)
+        assert found.same
+        assert not any(name.owner.startswith('tool') for name in found.names)
 
 
 @pytest.mark.parametrize('seed', [1, 2])
