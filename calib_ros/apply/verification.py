@@ -318,15 +318,11 @@ def _check(arm: Calibration, sets: Sequence[Observations], fitted: tuple[str, ..
     chain = arm.chain
     if not sets:
         raise ConfigError('sets must hold at least one set of Observations')
+    arm.require_frames(sets)
     for each in sets:
         chain.joint_values(each.joints)
         if each.distances is not None or each.socket:
             raise InputError('verification needs measured poses or positions, not distances')
-        if not {each.base, each.tool} <= set(chain.frame_names):
-            raise InputError(
-                f'the calibration knows the frames {", ".join(chain.frame_names)}, not '
-                f'{each.base} and {each.tool}: measure with the same device and target'
-            )
         if fitted and each.pixels is not None:
             raise InputError(
                 'images cannot locate a new base or tool: leave both as they were for the '

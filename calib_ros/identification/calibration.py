@@ -253,6 +253,17 @@ class Calibration(Shown):
         found = find_step(fitted, held=True)
         return found and replace(found, unused='')  # here every measurement counts
 
+    def require_frames(self, sets: Sequence[Observations]) -> None:
+        """Refuse measurements by devices or of targets that it does not know."""
+        known = self.chain.frame_names
+        labels = {name: label for name, (*_, label) in self.owners.items() if label}
+        for name in [n for each in sets for n in (each.base, each.tool) if n not in known][:1]:
+            told = [f'{n} ({labels[n]})' if n in labels else n for n in known]
+            raise InputError(
+                f'the calibration knows the frames {", ".join(told)}, not {name}: name devices '
+                'and targets as they were named for it, or identify again with these'
+            )
+
     def frames_of(self, owners: Mapping[str, records.Owner]) -> dict[str, str]:
         """Return the calibration's frame for each frame of new measurements.
 

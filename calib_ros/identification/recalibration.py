@@ -229,13 +229,7 @@ class _Arm:
                 'the earlier calibration has no parameter covariance: identify it again with this '
                 'version, from its own poses'
             )
-        known = previous.chain.frame_names
-        for each in sets:
-            if not {each.base, each.tool} <= set(known):
-                raise InputError(
-                    f'the earlier calibration knows the frames {", ".join(known)}, not '
-                    f'{each.base} and {each.tool}'
-                )
+        previous.require_frames(sets)
         chain, names, square = previous.chain, previous.names, previous.covariance
         square, device = square - previous.unmodelled.among(names).square, np.zeros_like(square)
         if (region := previous.region) is not None:

@@ -372,7 +372,7 @@ def test_what_cannot_be_verified_is_refused(cell, arm):
         verify(arm, [measured(true, joints[:4])], 1e-3)
     with pytest.raises(InputError, match='6 poses were measured; at least 7'):
         verify(arm, [seen], 1e-3, new_base=True)
-    with pytest.raises(InputError, match='not base_other and tool'):
+    with pytest.raises(InputError, match='not base_other: name devices'):
         verify(arm, [replace(seen, base='base_other')], 1e-3)
     with pytest.raises(InputError, match='not distances'):
         verify(arm, [replace(seen, distances=np.ones(len(seen)))], 1e-3)

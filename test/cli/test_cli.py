@@ -287,7 +287,8 @@ def test_a_device_that_a_calibration_does_not_know_has_no_frame_of_another(of_tw
     judged = ['new.csv', '--chain', 'ur5e', '--calibration', of_two]
     status, _, err = run('verify', *judged, '--new-base')
     assert status == 1
-    assert 'not base (optitrack) and tool: measure with the same device and target' in err
+    assert 'knows the frames base (leica), tool (ball), base_vicon_2 (vicon_2), ' in err
+    assert 'not base (optitrack): name devices and targets as they were' in err
 
 
 def test_a_loose_target_is_not_blamed_on_the_device_as_well(run, tmp_path):

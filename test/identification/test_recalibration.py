@@ -310,7 +310,7 @@ def test_what_is_needed_is_asked_for(earlier):
     with pytest.raises(InputError, match='has no parameter covariance'):
         recalibrate(replace(previous, covariance=None), few, 0.1)
     strange = replace(few.observations, base='base_other')
-    with pytest.raises(InputError, match='knows the frames base, tool, not base_other'):
+    with pytest.raises(InputError, match='knows the frames base, tool, not base_other: name'):
         recalibrate(previous, Problem(UR10E, strange), 0.1)
 
 
