@@ -51,7 +51,7 @@ OLDEST_PYTHON ?= python3.12
 OLDEST := .venv-oldest
 OLDEST_TESTS ?= test/apply test/cli test/files test/kinematics \
 	test/identification/test_identification.py test/sampling/test_session.py \
-	test/ros/test_node.py test/test_packaging.py
+	test/ros/test_node.py test/report/test_report_files.py test/test_packaging.py
 
 oldest: $(OLDEST)/installed
 	$(OLDEST)/bin/python -m pytest -n auto --dist worksteal $(OLDEST_TESTS) $(PYTEST_ARGUMENTS)

@@ -26,7 +26,7 @@ def test_gross_errors_do_not_spoil_the_closed_form(count, found):
     chain, seen = with_gross_errors(count, count // 3)
     seen = replace(seen, base='base_B', tool='tool_B')
     trial = trial_of(chain, (seen,))
-    assert (trial.error < 1e-9) == found
+    assert (trial.error < 1e-7) == found
     places = trial.arms[0][:, :3, 3], seen.positions
     spreads = (np.sqrt(((x - x.mean(axis=0)) ** 2).sum() / count) for x in places)
     assert trial.chain.all_frames.keys() >= {'base_B', 'tool_B'}
