@@ -22,7 +22,7 @@ from calib_ros.estimation.robust import LOSSES
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
-from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS, LENS_KINDS, Parameter, parameters_of
+from calib_ros.kinematics.parameter import DELAY, LENS_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.settings import Settings
 from calib_ros.shown import Shown
@@ -295,7 +295,9 @@ class Problem(Shown):
         for key in model.frame_names:
             frame = model.frame(key)
             if frame.fixed or key not in used:
-                held.update(parameters_of(key, (*FRAME_KINDS, DELAY)))
+                held.update(parameters_of(key))
+            if key not in used:
+                held.add(Parameter(key, DELAY))
             if frame.lens is None or frame.lens.fixed or key not in used:
                 held.update(parameters_of(key, LENS_KINDS))
         for each in self.sets:

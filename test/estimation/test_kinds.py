@@ -80,6 +80,18 @@ def test_distances_with_a_known_base_leave_no_gauge_of_the_world(rng):
     assert_exact(result.chain, wire(true, 200, rng))
 
 
+@pytest.mark.parametrize('held', [True, False])
+def test_a_known_place_of_a_device_does_not_tell_the_delay_of_its_stamps(held, rng):
+    true = faulty(UR10E, Cell(), rng)
+    seen, speed = between(true, 60, rng, noise=NOISE), rng.uniform(-0.5, 0.5, (60, 6))
+    late = replace(seen, joints=seen.joints + 4e-3 * speed, velocity=speed)
+    chain = replace(UR10E, base=replace(true.base, fixed=True)) if held else UR10E
+    result = identify(Problem(chain, late, **SIGMAS))
+    assert result.chain.base.delay == pytest.approx(4e-3, abs=2e-4)
+    assert result.accepted
+    assert result.noise.consistent
+
+
 def test_noisy_distances_are_honest_about_their_size(rng):
     true = faulty(UR10E, Cell(), rng)
     seen = wire(true, 300, rng, noise=NOISE[0])
