@@ -95,10 +95,10 @@ class Problem(Shown):
         if self.loss not in LOSSES:
             raise UnknownNameError('loss', self.loss, LOSSES)
         self._check_sets()
-        self._check_patterns()
-        self._check_effects()
         if not self.free:
             raise ConfigError('every parameter is fixed: nothing is left to identify')
+        self._check_patterns()
+        self._check_effects()
 
     def _check_sets(self) -> None:
         joints = len(self.chain.joints)
@@ -160,8 +160,11 @@ class Problem(Shown):
         for pattern in (*self.fixed, *self.priors):
             if not fnmatch.filter(self.model.all_parameters, pattern):  # b only of some arms
                 raise UnknownNameError('parameter', pattern, self.model.parameter_names)
-            of_lens = fnmatch.filter(LENS_KINDS, Parameter(pattern).kind)
-            if self.model.owns_frame(pattern) and not of_lens:
+            named: list[str] = [pattern]
+            if pattern in self.fixed:
+                named = fnmatch.filter(self.model.parameter_names, pattern)
+            kinds = [Parameter(name).kind for name in named if self.model.owns_frame(name)]
+            if not all(fnmatch.filter(LENS_KINDS, kind) for kind in kinds):
                 raise ConfigError(
                     'a frame is known or unknown as a whole, without a prior: if it is known, '
                     f'give it in the chain file with "fixed: true" instead of "{pattern}"'

@@ -172,7 +172,8 @@ def test_a_prior_holds_a_lens():
     )
     assert held.priors == {'base.fx': 1e-3, 'base.fy': 1e-3}
     assert held.chain.value('base.fx') == pytest.approx(wrong.fx, abs=0.1)
-    for held_so in ({'priors': {'base.x': 1.0}}, {'fixed': ('base.x',)}):
+    places = ('base.x', 'base.*', '*.z')
+    for held_so in ({'priors': {'base.x': 1.0}}, *({'fixed': (p,)} for p in places)):
         with pytest.raises(ConfigError, match='a frame is known or unknown as a whole'):
             Problem(known(False), seen, **held_so)
 
