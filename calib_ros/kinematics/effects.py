@@ -167,6 +167,7 @@ def basis(
     phi = np.zeros((len(names), q.shape[1]))
     if not names:
         return phi
+    q = led(chain, q)
     circles: dict[int, NDArray[np.complex128]] = {}
     for kind, (rows, joints, others) in _by_kind(tuple(names), chain.joint_names).items():
         if kind == 'ratio':
@@ -201,14 +202,30 @@ def _wave(
     return np.asarray(circles[joint][orders.astype(int) - 1])
 
 
+def led(
+    chain: _Arm, values: FloatArray, couplings: bool = True, rates: bool = False
+) -> FloatArray:
+    """Return joint values (n, B), or their `rates`, held joints where their couplings lead them.
+
+    Whatever is reported of these; without `couplings` at their limit.
+    """
+    if not chain.held:
+        return values
+    values, number = values.copy(), {name: k for k, name in enumerate(chain.joint_names)}
+    for k, end in chain.held.items():
+        values[k] = 0.0 if rates else end
+    for name, value in chain.effects if couplings else ():
+        joint, _, leader = name.partition('.coupling_')
+        if leader and number[joint] in chain.held:
+            values[number[joint]] += value * values[number[leader]]
+    return values
+
+
 def moved_joints(chain: _Arm, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
     """Return joint values (n, B) plus effects with phi (E, B); of held joints their limit."""
     known = dict(chain.effects)
     values = [known[name] for name in names]
-    if chain.held:
-        q = q.copy()
-        for k, end in chain.held.items():
-            q[k] = end
+    q = led(chain, q, couplings=False)
     if not any(values):
         return q
     shares = np.zeros((len(q), len(names)))

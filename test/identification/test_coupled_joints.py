@@ -14,7 +14,10 @@ from calib_ros import CalibrationSession, Problem, Settings, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
+from calib_ros.kinematics.effects import basis
+from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 
 Y = (0, 1, 0)
@@ -50,6 +53,20 @@ def test_mimicking_joints_follow_whatever_is_reported_of_them(rng):
     reported[:, 3:5] = rng.normal(size=(20, 2))
     expected = [reference_forward(PALLETISER, whole(row), 'base', 'tool0') for row in q]
     np.testing.assert_allclose(CHAIN.forward(reported), expected, rtol=0.0, atol=1e-9)
+
+
+def test_effects_and_delays_take_coupled_joints_where_they_are_led(rng):
+    """Whatever is reported of them: the torque of a weight in the hand, and the way in 1 s."""
+    chain = CHAIN.with_effects(['upper.gravity_wrist', 'level_1.ratio', 'level_2.sin_1'])
+    chain = chain.with_frame('base', Frame(delay=0.0))
+    names = [name for name, _ in chain.effects[2:]]
+    q, speeds = CHAIN.random_joints(5, rng), rng.normal(size=(5, 6))
+    actual = np.array([[*whole(row).values()] for row in q])
+    found, expected = (basis(chain, names, each.T, None) for each in (q, actual))
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12)
+    later, earlier = (chain.forward(q + step * speeds)[:, :3, 3] for step in (1e-6, -1e-6))
+    moved = ErrorModel(chain, ['base.delay']).jacobian(q, velocity=speeds)[:, :3, 0]
+    np.testing.assert_allclose(moved, (earlier - later) / 2e-6, rtol=0.0, atol=1e-8)
 
 
 @pytest.mark.parametrize('changes', [(0.0, 0.0), (-2e-3, 0.0), (1e-3, -1e-3)])
