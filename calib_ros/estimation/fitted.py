@@ -134,8 +134,10 @@ def _to_values(chain: Chain, names: Sequence[str]) -> FloatArray:
     """
     change = np.eye(len(names))
     for frame in chain.frame_names:
-        index = [names.index(name) for name in parameters_of(frame)[3:] if name in names]
-        if len(index) == 3:
-            vector = chain.frame(frame).offsets()[3:]
-            change[np.ix_(index, index)] = left_jacobian_inverse(vector)
+        turns = parameters_of(frame)[3:]
+        own = np.flatnonzero(np.isin(turns, names))  # two at a plane, which is alike all round
+        index = [names.index(turns[k]) for k in own]
+        if index:
+            whole = left_jacobian_inverse(chain.frame(frame).offsets()[3:])
+            change[np.ix_(index, index)] = whole[np.ix_(own, own)]
     return change
