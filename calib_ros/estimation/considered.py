@@ -121,7 +121,7 @@ def doubted_products(
     products = share * _products(chain, columns, few, doubts)
     extra = np.column_stack(system.separation_rows(chain, columns))
     own, count = len(columns) + 1, len(names)
-    products[:own, :own] += share * (extra.T @ extra)
+    products[:own, :own] += extra.T @ extra
     every = np.eye(len(products))
     row = {str(name): k for k, name in enumerate(columns)}
 

@@ -15,7 +15,9 @@ from calib_ros import Chain, Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.estimation.considered import Doubts, doubted_products
 from calib_ros.estimation.identifiability import structurally_independent
+from calib_ros.estimation.start import start_frames
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame, Joint
 from calib_ros.report.words import summary
@@ -151,6 +153,18 @@ def test_known_distances_that_the_arm_does_not_keep_are_no_step(slip):
     problem = replace(problem, observations=sets[0], more=sets[1:], separations=apart)
     step = identify(problem).step
     assert (step and (step.what, step.sample)) == (('joint_4', 15) if slip else None)
+
+
+def test_known_distances_count_once_however_the_touches_are_thinned():
+    _, problem = cell(0)
+    sets = [each.select(np.repeat(np.arange(30), 4)) for each in problem.sets]
+    system = problem.system(sets)
+    chain = start_frames(problem)
+    every, few = (
+        doubted_products(chain, problem.free, system, Doubts(), most=system.count // share).plain
+        for share in (1, 4)
+    )
+    np.testing.assert_allclose(few, every, rtol=1e-9, atol=1e-9 * np.abs(every).max())
 
 
 @pytest.mark.parametrize('error', [0.0, 0.01])
