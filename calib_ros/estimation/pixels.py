@@ -82,10 +82,11 @@ class PixelSamples(Samples):
             fold = np.zeros(len(block.owner), np.intp) if folds is None else folds[block.part]
             for k, (matrix, _) in enumerate(found):
                 images, points = fold[block.begins] == k, fold == k
-                turned = twist[images].reshape(-1, size).T
+                shape = 6 * np.count_nonzero(images), size  # may be zero
+                turned = twist[images].reshape(shape).T
                 mixed = turned @ inner[images, :, 6:].reshape(-1, len(own))
                 alone = block.columns[6:, :, points].reshape(len(own), -1)
-                matrix[:-1, :-1] += turned @ outer[images].reshape(-1, size)
+                matrix[:-1, :-1] += turned @ outer[images].reshape(shape)
                 matrix[:-1, own] += mixed
                 matrix[own, :-1] += mixed.T
                 matrix[own[:, np.newaxis], own] += alone @ alone.T
@@ -165,7 +166,7 @@ class PixelSamples(Samples):
         axes, origin, *found = model.linearise(joints[:, images], approach, moving)
         twist = model.twists(*found)
         if self.observations.on_flange:  # in the axes of the camera, which moves the other way
-            flat = twist.reshape(len(twist), 2, 3, -1)
+            flat = twist.reshape(len(twist), 2, *axes.shape[1:])
             twist = np.einsum('kcm,pscm->pskm', axes, flat).reshape(twist.shape)
         return axes, origin, twist
 

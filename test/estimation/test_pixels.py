@@ -66,6 +66,15 @@ def test_the_jacobian_is_that_of_differences(on_flange, seed):
 
 
 @pytest.mark.parametrize('on_flange', [True, False])
+def test_images_between_two_held_frames_are_identified(on_flange):
+    true, seen = scene(1, on_flange)
+    held = {end: replace(true.frame(end), fixed=True) for end in ('base', 'tool')}
+    result = identify(Problem(replace(UR, **held), seen))
+    assert result.accepted
+    assert not any(true.owns_frame(name) for name in result.names)
+
+
+@pytest.mark.parametrize('on_flange', [True, False])
 def test_products_are_those_of_the_rows(on_flange):
     true, seen = scene(1, on_flange, 5)
     seen = seen.select((np.arange(len(seen)) % 7 != 0) & (np.arange(len(seen)) < 3 * 24 + 2))
