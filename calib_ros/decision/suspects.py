@@ -308,7 +308,8 @@ def _of_joint(chain: Chain, k: int) -> Iterator[Suspect]:
     for (degrees, angle), sign in product({'': 0.0, **quarters}.items(), (-1.0, 1.0)):
         parts, given = [other] * (sign < 0.0), f'{"-" * (sign < 0.0)}{column}'
         if degrees:
-            parts.append((f'has its zero {degrees[1:]} degrees away', f'theta {degrees} degrees'))
+            turned = chain.joints[k].sign * round(np.degrees(angle))
+            parts.append((f'has its zero {degrees[1:]} degrees away', f'theta {turned:+} degrees'))
             given += f'{degrees[0]}{abs(angle):.16g} ({degrees} if in degrees)'
         if parts:
             whats, in_file = zip(*parts, strict=True)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which of equivalent mistakes are named, and which may occur together."""
 
+import re
 from dataclasses import replace
 from functools import reduce
 from itertools import combinations, pairwise
@@ -20,6 +21,7 @@ from calib_ros.kinematics.chain import Frame
 
 DEGREES = 'and the joint values in degrees'
 BASE_ZERO = 'has its zero 90 degrees away'
+IN_FILE = r'(?:sign: (\S+))?(?: and )?(?:theta (\S+) degrees)? in the chain file'
 LAST = 'linear_axis_joint and shoulder_pan_joint last'
 RANKS = {
     'the positions and linear joints are in mm, not metres': (1, 'measured'),
@@ -299,3 +301,29 @@ def test_a_wrong_sign_in_the_dh_table_is_named(kind, which, accepted, rng):
     said = found.remarks if accepted else found.refusals
     of = which[0] if len(which) == 1 else 'all joints'
     assert f'{kind} of {of} has the other sign: correct {kind} in the chain file' in said[0]
+
+
+def test_signs_and_zeros_to_set_in_the_chain_file_do_what_the_columns_do(rng):
+    """A joint that counts the other way round in the file turns the other way, too."""
+    fanuc = load_chain('fanuc_r2000ic_165f')
+    assert {joint.sign for joint in fanuc.joints} == {1, -1}
+    seen = measure(fanuc, fanuc.random_joints(5, rng), rng)
+    checked = 0
+    for each in suspects(fanuc, (seen,)):
+        if told := re.fullmatch(IN_FILE, each.published):
+            sign, theta = told.groups()
+            joints = [
+                replace(
+                    joint,
+                    sign=int(sign or joint.sign),
+                    theta=joint.theta + np.radians(float(theta or 0.0)),
+                )
+                if joint.name == each.part
+                else joint
+                for joint in fanuc.joints
+            ]
+            (undone,) = each.undone((seen,))
+            found = replace(fanuc, joints=tuple(joints)).forward(seen.joints)
+            np.testing.assert_allclose(found, fanuc.forward(undone.joints), atol=1e-9)
+            checked += 1
+    assert checked == 6 * 7
