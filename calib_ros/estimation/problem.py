@@ -158,13 +158,12 @@ class Problem(Shown):
 
     def _check_patterns(self) -> None:
         for pattern in (*self.fixed, *self.priors):
-            if not fnmatch.filter(self.model.all_parameters, pattern):  # b only of some arms
+            own = fnmatch.filter(self.model.all_parameters, pattern)
+            if not own:  # b only of some arms
                 raise UnknownNameError('parameter', pattern, self.model.parameter_names)
-            named: list[str] = [pattern]
-            if pattern in self.fixed:
-                named = fnmatch.filter(self.model.parameter_names, pattern)
-            kinds = [Parameter(name).kind for name in named if self.model.owns_frame(name)]
-            if not all(fnmatch.filter(LENS_KINDS, kind) for kind in kinds):
+            of_frames = [self.model.owns_frame(n) and not Parameter(n).of_lens for n in own]
+            # priors in a wider pattern pass frames by
+            if all(of_frames) or (pattern in self.fixed and any(of_frames)):
                 raise ConfigError(
                     'a frame is known or unknown as a whole, without a prior: if it is known, '
                     f'give it in the chain file with "fixed: true" instead of "{pattern}"'
@@ -172,15 +171,15 @@ class Problem(Shown):
 
     def _check_effects(self) -> None:
         for name in self.effects:
-            if not effects.resolve(self.chain, name):
+            groups = {effects.group_of(each) for each in effects.resolve(self.chain, name)}
+            if not groups:
                 raise ConfigError(
                     f'this chain has nothing to fit in "{name}" (gear needs the gear_ratio of '
                     'joints in the chain file)'
                 )
-            group = effects.group_of(f'.{name}')
-            if group == 'compliance' and not any(joint.mass for joint in self.chain.joints):
+            if 'compliance' in groups and not any(joint.mass for joint in self.chain.joints):
                 raise ConfigError('compliance needs the masses of the links in the chain file')
-            if group == 'backlash' and all(each.approach is None for each in self.sets):
+            if 'backlash' in groups and all(each.approach is None for each in self.sets):
                 raise ConfigError('backlash needs the signs of the last moves (s1 ... sn)')
 
     @cached_property

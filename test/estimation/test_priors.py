@@ -9,7 +9,7 @@ import pytest
 from fits import SIGMAS, UR10E, measured_arm, rms
 
 from calib_ros.apply.simulation import Cell
-from calib_ros.errors import TooFewObservationsError, UnknownNameError
+from calib_ros.errors import ConfigError, TooFewObservationsError, UnknownNameError
 from calib_ros.estimation.evidence import posterior_of
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.identifiability import structurally_independent
@@ -107,6 +107,17 @@ def test_a_pattern_may_hold_what_only_other_arms_have(rng):
     for slip in ('*.betta', 'elbow.b'):
         with pytest.raises(UnknownNameError, match='unknown parameter'):
             Problem(UR10E, seen, fixed=(slip,))
+
+
+@pytest.mark.parametrize('pattern', ['base.*', '*.rx', 'b*', 'tool.z'])
+def test_no_pattern_holds_a_part_of_a_frame(pattern, rng):
+    """It would stay where the start put it; a prior on all parameters passes frames by."""
+    *_, seen = measured_arm(rng, 30)
+    with pytest.raises(ConfigError, match='a frame is known or unknown as a whole'):
+        Problem(UR10E, seen, fixed=(pattern,))
+    assert set(Problem(UR10E, seen, priors={'*': 1e-3}).given) == {
+        name for name in Problem(UR10E, seen).free if not UR10E.owns_frame(name)
+    }
 
 
 def test_sigmas_that_are_too_large_do_not_hold_few_poses_near_nominal():

@@ -218,8 +218,10 @@ def test_gear_ratios_need_not_be_whole(ratio, rng):
     ('group', 'lacking'),
     [
         ('backlash', 'backlash needs the signs of the last moves'),
+        ('elbow_joint.backlash', 'backlash needs the signs of the last moves'),
         ('gear', r'nothing to fit in "gear" \(gear needs the gear_ratio of joints'),
         ('compliance', 'compliance needs the masses of the links'),
+        ('elbow_joint.compliance', 'compliance needs the masses of the links'),
     ],
 )
 def test_a_group_without_what_it_goes_by_is_refused(group, lacking):
