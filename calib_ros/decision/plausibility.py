@@ -38,8 +38,8 @@ from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.start import fit_to_arm
+from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.effects import members
 from calib_ros.kinematics.parameter import DELAY, IN_A_FRAME, LENS_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXACT, EXCEPTION, Settings
@@ -82,7 +82,7 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
         refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
         sigmas = ''
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
-    found = (lens, board, coupled, motion, _order(problem), sigmas)
+    found = (lens, board, coupled, _level(problem, result), motion, _order(problem), sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
     return _lag(problem, replace(result, remarks=remarks, refusals=tuple(refusals)))
 
@@ -133,6 +133,20 @@ def _sessions(problem: Problem, result: Identification) -> str:
         f'one arm does not fit all sessions: alone each fits {result.noise.position / worst:.1f} '
         'times as well or better. Is it the same robot, did nothing happen to it in between, and '
         'are the devices true to scale? Identify each alone (--session) and compare them'
+    )
+
+
+def _level(problem: Problem, result: Identification) -> str:
+    """Return that couplings which keep the hand level hide an unknown place of the target."""
+    places = [p.name for p in result.parameters if p.status == 'gauge' and p.name.is_length]
+    known = problem.chain.all_frames
+    hidden = [n for n in places if n.owner.startswith('tool') and known.get(n.owner) is None]
+    if not (hidden and effects.coupled(problem.chain)):
+        return ''
+    return (
+        f'a hand that couplings keep level hides {", ".join(hidden)}, but tilts by errors of the '
+        'arm move the target, the more the further off it is: give tool in the chain file, to a '
+        'centimetre'
     )
 
 
@@ -187,7 +201,7 @@ def _lag(problem: Problem, result: Identification) -> Identification:
     share = explained_share(late, chain, result.names, delays)
     if share < EXPLAINED:
         return result
-    play = [name for name in members(chain, 'backlash') if name not in result.names]
+    play = [name for name in effects.members(chain, 'backlash') if name not in result.names]
     played = explained_share(late, chain.with_effects(play), result.names, play)
     if played > share:
         text = (

@@ -190,6 +190,7 @@ class Judged:
         ({'sessions': 'two', 'lens': 'lens', 'given': 'gain'}, False, ['gain'], []),
         ({'given': 'mistake', 'sigmas': 's'}, False, ['mistake', 's'], []),
         ({'coupled': True, 'motion': 'fast', 'order': 'one way'}, True, [], ['fast', 'one way']),
+        ({'level': 'tool.z', 'motion': 'fast'}, True, [], ['tool.z', 'fast']),
     ],
 )
 def test_what_explains_a_refusal_comes_before_it(found, another, refused, remarked, monkeypatch):
@@ -200,6 +201,7 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
         '_sigmas': found.get('sigmas', ''),
         '_scale': [Reason(Rule.SCALE, found['scale'])] if 'scale' in found else [],
         '_sessions': found.get('sessions', ''),
+        '_level': found.get('level', ''),
         '_motion': found.get('motion', ''),
     }
     for name, part in parts.items():

@@ -104,6 +104,22 @@ def test_what_the_coupled_joints_show_is_identified_and_the_rest_named_a_gauge(o
     assert rms(result.chain, true, fresh) < 0.05 * rms(result.before, true, fresh)
 
 
+def test_the_hidden_height_of_a_target_on_a_level_hand_is_asked_for(rng):
+    """Tilts by errors of the arm move it, too: 1 mrad at 0.3 m."""
+    level = chain_from_urdf(PALLETISER.replace('offset="0.1"', 'offset="0.0"'))
+    true = faulty(level, Cell(), rng)
+    true = true.with_offsets({'tool.z': -0.3 - true.value('tool.z')})
+    seen = measure(true, level.random_joints(60, rng), rng, *NOISE)
+    roughly = true.with_offsets({'tool.z': 0.01}).tool
+    errors = []
+    for tool in (None, roughly):
+        result = identify(Problem(replace(level, base=None, tool=tool), seen, **SIGMAS))
+        asked = 'hides tool.z, but tilts by errors of the arm move the target'
+        assert any(asked in each for each in result.remarks) == (tool is None)
+        errors.append(rms(result.chain, true, level.random_joints(200, rng)))
+    assert errors[1] < 0.5 * errors[0]
+
+
 @pytest.mark.parametrize('second', ['motor" multiplier="-1" offset="0.2', 'outer" multiplier="-2'])
 def test_the_first_joint_of_a_column_leads_the_others_of_a_motor_elsewhere(second, rng):
     """Two lifts mimic one that is not between the links, or one of them the other."""
