@@ -8,9 +8,10 @@ x ~ N(0, K), such as the uncertainty of an earlier calibration, are marginalised
 
     A' = A - A C A        b' = b - A C b        C = R (1 + R^T A R)^-1 R^T,  K = R R^T
 
-An explanation is x = G z: one parameter, all of a joint, with theta and d of the next (a bent
-link) or not, all of a frame (a moved device or target), a shift of a frame, or the scale of the
-device has changed. It reduces chi-squared, with as many degrees of freedom as z, by
+An explanation is x = G z: one parameter, all of a joint, with theta and d of the next or not (a
+bent link; in the modified convention of the one before), all of a frame (a moved device or
+target), a shift of a frame, or the scale of the device has changed. It reduces chi-squared, with
+as many degrees of freedom as z, by
 
     (G^T b')^T (G^T A' G)^-1 (G^T b')
 
@@ -233,7 +234,7 @@ def likelier(
     tried = [given]
     tried += [list(some) for k in range(2, SEVERAL + 1) for some in combinations(single, k)]
     tried += [[columns.zeros]] * (len(single) > SEVERAL)  # of fewer all are among these
-    # a link with parts of the next joint is the same link
+    # a link with parts of a neighbouring joint is the same link
     choices = sum(owner in (LOAD, own[-1].owner) for owner, own in columns.sets)
 
     def likely(causes: Sequence[Sequence[Parameter]]) -> float:
@@ -284,10 +285,12 @@ class Effects:
         self._columns |= dict(zip(names, np.eye(len(names)), strict=True))
         self._count = len(names)
         sets: list[tuple[str, tuple[Parameter, ...]]] = []
-        for joint, *after in (chain.joint_names[k : k + 2] for k in range(len(chain.joints))):
+        other = -1 if chain.convention == 'modified' else 1  # at the far end of the row's link
+        for k, joint in enumerate(chain.joint_names):
             own = self._distinct(parameters_of(joint, ORDER))
             sets += [(joint, (name,)) for name in own]
-            link = (*own, *(name for each in after for name in parameters_of(each, ORDER[:2])))
+            beside = chain.joint_names[k + other : k + other + 1] if k + other >= 0 else ()
+            link = (*own, *(name for each in beside for name in parameters_of(each, ORDER[:2])))
             wholes = dict.fromkeys((own, self._distinct(link)))
             sets += [(joint, some) for some in wholes if len(own) > 1]
         for frame in frames:

@@ -10,6 +10,7 @@ import pytest
 from fits import SCARA, UR10E
 from scipy import optimize
 
+from calib_ros import load_chain
 from calib_ros.decision import changes
 from calib_ros.decision.changes import (
     SCALE_OF_DEVICE,
@@ -22,8 +23,10 @@ from calib_ros.decision.changes import (
     root_of,
     shown,
 )
+from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.levels import chance_of
 from calib_ros.estimation.start import fit_to_arm
+from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.settings import LEVER
 
@@ -33,6 +36,30 @@ def test_frames_that_cannot_have_moved_take_what_they_can(frames, owners):
     """A tilted quill moves its tip as the elbow does, and as another tool would."""
     found = Effects(SCARA, [Parameter('elbow.theta')], frames)
     assert {owner for owner, _ in found.sets} == owners
+
+
+@pytest.mark.parametrize(('arm', 'row'), [('ur10e', 0), ('franka_fr3', 1)])
+def test_all_that_a_bent_link_moves_is_one_change(arm, row):
+    """Of the joint whose row has the link: in the modified convention the one behind it."""
+    chain = load_chain(arm)
+    frames = [*parameters_of('base'), *parameters_of('tool')]
+    every = structurally_independent(chain, [*frames, *chain.parameter_names[12:]])
+    names = [name for name in every if name not in frames]
+    q = chain.random_joints(50, np.random.default_rng(0))
+    model, walked = ErrorModel(chain, [*frames, *names]), np.empty((len(q[0]) + 1, 4, 3, len(q)))
+    rows, places = model.jacobian(q), chain.forward(q)[:, :3, 3].T
+    chain.walk.frames(chain.effective(q.T), np.eye(4), walked)
+    columns = Effects(chain, names)
+    for k in range(1, len(chain.joints) - 2):
+        axes, place = walked[k + 1, :3], walked[k + 1, 3]
+        turned = [np.cross(axis, places - place, axis=0) for axis in axes]
+        shifts, turns = np.concatenate([axes, 0.0 * axes], 1), np.concatenate([turned, axes], 1)
+        moved = np.concatenate([shifts, turns]).T.reshape(-1, 6)
+        owner = chain.joint_names[k + row]
+        link = max((own for joint, own in columns.sets if joint == owner), key=len)
+        known = np.concatenate([rows[..., :12], rows[..., 12:] @ columns.of(link)], 2)
+        known = known.reshape(len(moved), -1)
+        np.testing.assert_allclose(known @ np.linalg.lstsq(known, moved)[0], moved, atol=1e-9)
 
 
 def test_another_height_of_the_target_shows_as_one_of_the_device():
