@@ -41,7 +41,7 @@ from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER
-from calib_ros.estimation.start import in_new_frames
+from calib_ros.estimation.start import in_new_frames, released
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -339,8 +339,7 @@ def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str
     new = [*dict.fromkeys(getattr(each, end) for end in fitted for each in sets)]
     if not new:
         return chain
-    for name in new:
-        chain = chain.with_frame(name, replace(chain.frame(name), fixed=False))
+    chain = released(chain, new)
     plain = [replace(s, oriented=np.zeros_like(s.oriented), covariance=None) for s in sets]
     problem = Problem(chain, plain[0], more=plain[1:], loss='none')
     chain = in_new_frames(problem, chain, new, problem.system(plain), needed=False)

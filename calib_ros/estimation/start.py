@@ -85,8 +85,7 @@ def in_new_frames(
     """
     known = arm
     for name in arm.frame_names:
-        frame = arm.frame(name)
-        known = known.with_frame(name, replace(frame, fixed=frame.fixed or name not in new))
+        known = known.with_frame(name, replace(arm.frame(name), fixed=name not in new))
     own = movable(known, new)
     found = start_frames(replace(problem, chain=known))
     if needed:
@@ -96,6 +95,13 @@ def in_new_frames(
     for name in new:
         arm = arm.with_frame(name, replace(arm.frame(name), matrix=placed.frame(name).matrix))
     return arm
+
+
+def released(chain: Chain, names: Iterable[str]) -> Chain:
+    """Return the chain with frames that are not fixed."""
+    for name in names:
+        chain = chain.with_frame(name, replace(chain.frame(name), fixed=False))
+    return chain
 
 
 def _check_shown(

@@ -40,6 +40,7 @@ from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.start import released
 from calib_ros.identification import records
 from calib_ros.identification.age import recorded_time
 from calib_ros.kinematics import se3
@@ -244,8 +245,7 @@ class Calibration(Shown):
         """Return what moved while new measurements were taken, if that explains most errors."""
         chain = self.chain
         arm = tuple(name for name in chain.parameter_names if not chain.owns_frame(name))
-        for name in chain.frame_names:
-            chain = chain.with_frame(name, replace(chain.frame(name), fixed=False))
+        chain = released(chain, chain.frame_names)
         try:
             _, _, fitted = fit(Problem(chain, sets[0], more=tuple(sets[1:]), fixed=arm))
         except InputError:  # too few for frames of their own

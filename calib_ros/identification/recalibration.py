@@ -35,7 +35,7 @@ from calib_ros.estimation.levels import SCALE, SEVERAL, TRIED, chance_of
 from calib_ros.estimation.observations import SOME_POSES, Observations, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER
-from calib_ros.estimation.start import in_new_frames
+from calib_ros.estimation.start import in_new_frames, released
 from calib_ros.identification.age import drift_of, recorded_time
 from calib_ros.identification.calibration import Calibration, about, made
 from calib_ros.identification.recalibrated import Recalibration
@@ -63,6 +63,9 @@ def recalibrate(
     of angles twice that [rad]. `new` are frames of moved devices and of remounted targets. Raises
     InputError if the calibration has no covariance or lacks a frame, or for a mistake.
     """
+    previous = _released(previous, new)
+    ours = [name for name in new if name in problem.chain.frame_names]
+    problem = replace(problem, chain=released(problem.chain, ours))
     if mistake := mistakes.explained(problem, far=True):
         raise InputError(f'the new poses do not fit the arm: {mistake}')
     try:
@@ -99,6 +102,15 @@ def recalibrate(
     return found
 
 
+def _released(previous: Calibration, new: Sequence[str]) -> Calibration:
+    """Return a calibration whose new frames are not fixed where they were."""
+    region = previous.region
+    if region is not None:
+        region = replace(region, chain=released(region.chain, new))
+    chain, before = released(previous.chain, new), released(previous.before, new)
+    return replace(previous, chain=chain, before=before, region=region)
+
+
 def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Problem]]:
     """Yield set and pose with the largest errors by a chain, and the problem without it."""
     sets = problem.all_sets
@@ -128,7 +140,7 @@ def _recalibrated(
     arm, system = _Arm.of(previous, sets, years, growth), _system(problem, sets, previous)
     # corrected axes are never quite parallel
     nominal = previous.before.with_effects([name for name, _ in arm.chain.effects])
-    own = [n for end in new if not arm.chain.frame(end).fixed for n in parameters_of(end)]
+    own = [n for end in new for n in parameters_of(end)]
     anywhere = 10.0 * changes.shown(nominal, arm.names, own)  # m, rad
     if anywhere.size:
         chain = in_new_frames(problem, arm.chain, new, system)

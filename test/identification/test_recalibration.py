@@ -314,6 +314,21 @@ def test_what_is_needed_is_asked_for(earlier):
         recalibrate(previous, Problem(UR10E, strange), 0.1)
 
 
+def test_a_device_whose_place_was_given_may_be_moved(rng):
+    """As new, it is no longer where the chain file holds it."""
+    true = faulty(UR10E, Cell(), rng)
+    given = replace(UR10E, base=replace(true.base, fixed=True))
+    seen = measure(true, UR10E.random_joints(60, rng), rng, *NOISE)
+    previous = Calibration.of(identify(Problem(given, seen, **SIGMAS)))
+    now = replace(true, base=random_frame(rng, 1.0))
+    few = measure(now, UR10E.random_joints(12, rng), rng, *NOISE)
+    found = recalibrate(previous, Problem(given, few, **SIGMAS), 0.1, new=('base',))
+    assert found.accepted
+    assert not found.changed
+    assert not found.calibration.chain.base.fixed
+    assert rms(found.calibration.chain, now, Q) < 1.5 * rms(previous.chain, true, Q)
+
+
 @needs_data
 def test_poses_that_do_not_tell_of_new_frames_are_too_few():
     """Eight poses of a UR10 on another day; the device stands elsewhere, the target is new.
