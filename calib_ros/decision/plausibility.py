@@ -62,7 +62,7 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
 
     `another` is false if a mistake is already named, which comes first.
     """
-    if any(each.socket or each.plane for each in problem.sets):  # shows only the scale of a bar
+    if all(each.socket or each.plane for each in problem.sets):  # shows only the scale of a bar
         refused = _scale(problem, result) if problem.separations else []
         return replace(result, refusals=(*result.refusals, *refused))
     lens, imitated = _lens(problem, result) if another else ('', False)

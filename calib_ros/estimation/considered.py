@@ -141,11 +141,11 @@ def doubted_products(
 def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], float]:
     """Return all lengths [m] that positions depend on, and the standard deviation of their scale.
 
-    There are none for sockets and planes, whose places are fixed, unless a bar is between them.
+    There are none for sockets and planes alone, whose places are fixed, unless a bar is between.
     The travel of a prismatic joint is scaled by its ratio, which is added to the returned chain.
     """
     sets = [samples.observations for samples in system.sets]
-    if any(each.socket or each.plane for each in sets) and not system.separations:
+    if all(each.socket or each.plane for each in sets) and not system.separations:
         return chain, {}, SCALE
     travels = [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
     chain = chain.with_effects(travels)

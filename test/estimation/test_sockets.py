@@ -196,11 +196,15 @@ def test_a_socket_without_any_pair_is_named():
         identify(replace(problem, more=(*problem.sets[1:3], nothing, *problem.sets[4:])))
 
 
-def test_a_tracker_beside_a_socket_is_not_weighed_as_out_of_scale():
-    """Where a set has no lengths another column took the place of the scale: +60 %."""
+@pytest.mark.parametrize('scale', [1.0, 1.003])
+def test_a_tracker_beside_a_socket_is_as_much_out_of_scale_as_alone(scale):
     true, problem = cell(0)
     rng = np.random.default_rng(0)
     seen = measure(true, true.random_joints(40, rng), rng, *NOISE)
-    result = identify(Problem(IIWA, seen, more=problem.sets[:1], **SIGMAS))
-    assert result.accepted
-    assert (result.posterior.rival, result.posterior.scale) == (None, 0.0)
+    seen = replace(seen, positions=scale * seen.positions)
+    alone, beside = (
+        identify(Problem(IIWA, seen, more=more, **SIGMAS)).posterior
+        for more in ((), problem.sets[:1])
+    )
+    assert beside.scale == pytest.approx(alone.scale, abs=1e-4)
+    assert beside.rival[0] == pytest.approx(alone.rival[0], abs=1.0)

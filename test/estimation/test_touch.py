@@ -12,6 +12,7 @@ from scipy import special
 from calib_ros import Chain, Observations, Problem, identify, load_chain, read_table
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.plausibility import _apart
+from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation import start
 from calib_ros.estimation.evidence import posterior_of
@@ -262,3 +263,14 @@ def test_a_plane_needs_heights_and_a_sigma():
         replace(seen, distances=None)
     with pytest.raises(ConfigError, match='sigma_touch'):
         Problem(UR, seen, sigma_touch=0.0)
+
+
+def test_touches_beside_poses_do_not_vouch_for_the_scale_of_the_device():
+    """A dozen had a device 0.3 % out of scale accepted, and arms of 0.8 mm became 2.6 mm wrong."""
+    rng = np.random.default_rng(0)
+    true = faulty(UR, Cell(2e-4, 3e-4), rng)
+    seen = measure(true, UR.random_joints(60, rng), rng, SIGMA, 2e-4)
+    seen = replace(seen, positions=1.003 * seen.positions)
+    met = Observations.touching(touched(true, PLANES[0], 12, rng), base='base_plane')
+    result = identify(Problem(UR, seen, more=(met,)))
+    assert [each.rule for each in result.refusals] == [Rule.SCALE]
