@@ -55,9 +55,7 @@ from calib_ros.values import SAME
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
 STANDS: dict[Verdict, Verdict] = {'PASS': 'holds', 'FAIL': 'does not hold'}
-NEEDED = 1 + len(TILTED)
-"""Configurations needed for a verdict, besides those for fitted frames: the test poses of ISO
-9283."""
+NEEDED = 1 + len(TILTED)  # configurations without those for fitted frames: as in ISO 9283
 DECIDING = 10 * MOST_ENTRIES  # largest number of configurations reported as deciding
 
 
@@ -103,8 +101,7 @@ class Verification(Shown):
     the former error is unknown; no verdict either if fitted measurements look good, or if a
     `mistake` explains them."""
     needed: int | None
-    """Number of configurations that would decide with the same RMS error, if undecided; None if
-    even DECIDING would not."""
+    """Configurations that would decide with the same RMS error; None if not even DECIDING."""
     common: float
     """Share of the RMS error that remains without one common shift and turn of all positions."""
     by_program: bool
@@ -113,6 +110,8 @@ class Verification(Shown):
     """Frames fitted to the new measurements."""
     reused: float = 0.0
     """Share of the measurements that the calibration was fitted to (`Calibration.reused`)."""
+    outside: float = 0.0
+    """Share of the measurements outside the region of the calibration."""
     uncorrected: bool = False
     """Whether all measurements were taken at the joint values of the program as it was given."""
     odd: tuple[int, ...] = ()
@@ -170,9 +169,8 @@ def verify(
     calibration holds: the limit is then `Calibration.limit`. `confidence` is that of the interval;
     `progress` receives the share done.
 
-    With `new_base` the measuring device was moved, with `new_tool` the target was replaced or
-    remounted. Their frames are fitted: a new base absorbs the errors of two configurations, a new
-    tool those of one.
+    With `new_base` the measuring device was moved, with `new_tool` the target replaced or
+    remounted. Their frames are fitted, which absorbs the errors of two configurations and of one.
 
     `commanded` (M, n) are joint values [rad or m] of the uncorrected program: the nominal arm
     defines the wanted poses there. Each measurement belongs to one of them, as it is or corrected.
@@ -208,6 +206,7 @@ def verify(
         by_program=commanded is not None,
         fitted=fitted,
         reused=reused,
+        outside=arm.outside(sets),
         uncorrected=uncorrected,
         odd=() if limit is None else _odd(moments, lost, limit, confidence),
         mistake=mistake,

@@ -241,6 +241,13 @@ class Calibration(Shown):
         """Return the share of measurements that this calibration was fitted to, if known."""
         return 0.0 if self.rows is None else self.rows.share(sets)
 
+    def outside(self, sets: Sequence[Observations]) -> float:
+        """Return the share of measurements where it may not be used."""
+        if self.region is None:
+            return 0.0
+        joints = np.concatenate([each.joints for each in sets])
+        return 1.0 - float(np.mean(self.region.covers(joints)))
+
     def step(self, sets: Sequence[Observations]) -> Step | None:
         """Return what moved while new measurements were taken, if that explains most errors."""
         chain = self.chain

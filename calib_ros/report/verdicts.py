@@ -142,8 +142,15 @@ def hints(found: Verification) -> list[str]:
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
         lines.append(f'{enough} poses with the same RMS error would decide, these included')
     before, rms = (each.rms_mm for each in found.comparison.figures)
+    if found.outside and not found.mistake:
+        lines.append(
+            f'{100.0 * found.outside:.3g} % of the measurements are outside the region of the '
+            'calibration, where it may make the arm worse and compensate refuses: verify within '
+            'it, or identify with poses like these'
+        )
     if rms > before and not (found.mistake or found.uncorrected or causes(found)):
-        lines.append('the nominal arm would be nearer: is the calibration that of this robot?')
+        whose = '' if found.outside > 0.5 else ': is the calibration that of this robot?'
+        lines.append(f'the nominal arm would be nearer{whose}')
     return lines
 
 

@@ -214,6 +214,20 @@ def test_a_robot_that_is_not_that_of_the_calibration_is_told(arm, seed, told):
     assert ('is the calibration that of this robot?' in in_words(found)) is told
 
 
+def test_poses_outside_the_region_are_told(arm):
+    """A calibration of a small region, verified elsewhere, is not that of another robot."""
+    other = simulation.faulty(UR, simulation.Cell(), np.random.default_rng(5))
+    seen = measured(other, UR.random_joints(20, np.random.default_rng(3)), 1)
+    expected = np.sort(arm.region.known(seen.joints))
+    for limit, share in ((np.inf, ''), (expected[14:16].mean(), '25'), (expected[0] / 2, '100')):
+        near = replace(arm, region=replace(arm.region, limit=limit))
+        text = in_words(verify(near, [seen], 1e-3, new_base=True, new_tool=True))
+        told = f'{share} % of the measurements are outside the region' if share else ''
+        assert told in text
+        assert ('outside the region' in text) is bool(share)
+        assert ('is the calibration that of this robot?' in text) is (share != '100')
+
+
 def test_units_are_named_though_a_common_motion_would_take_most_of_the_error(arm):
     far = with_errors(arm, 30.0 + np.random.default_rng(0).normal(scale=0.1, size=(9, 3)))
     text = in_words(found := verify(arm, [far], 1e-3))
