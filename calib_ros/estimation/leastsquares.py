@@ -24,7 +24,7 @@ from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray, Index
-from calib_ros.settings import EXACT, EXCEPTION, Settings
+from calib_ros.settings import EXACT, Settings
 from calib_ros.shown import Shown
 
 Folds: TypeAlias = Sequence[Index]  # fold number (N,) of every sample, set by set
@@ -32,9 +32,6 @@ STEP_TOLERANCE = 1e-6
 """Convergence: the RMS step of the predictions in sigma or, if larger, in RMS residuals. A
 thousandth of the uncertainty with a million rows."""
 PATIENCE = SEVERAL  # successive steps that may raise the cost before steps are damped
-SEPARATION_SIGMA = EXCEPTION * Settings.sigma_position
-"""Assumed standard deviation [m] of known socket distances: nearly exact compared with a
-device."""
 SMALL_STEP = math.sqrt(EXACT)
 """Step [m or rad] whose second-order error, half its square, is negligible."""
 
@@ -68,6 +65,8 @@ class System(Shown):
     sets: tuple[Samples, ...]
     prior: Prior | None = None
     separations: tuple[tuple[str, str, float], ...] = ()
+    sigma_scale: float = 0.0
+    """Relative standard deviation of these; 0 for that of devices [m] by default."""
 
     def extra_rows(self, chain: Chain, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         """Return Jacobian (R, P) and residual (R,) in sigma of priors and known separations."""
@@ -85,12 +84,14 @@ class System(Shown):
         for i, (first, second, distance) in enumerate(self.separations):
             apart = chain.frame(second).matrix[:3, 3] - chain.frame(first).matrix[:3, 3]
             length = max(float(np.linalg.norm(apart)), 1e-12)
-            residual[i] = (distance - length) / SEPARATION_SIGMA
+            residual[i] = distance - length
             for frame, sign in ((first, -1.0), (second, 1.0)):
                 for k, name in enumerate(parameters_of(frame)[:3]):
                     if name in column:
                         rows[i, column[name]] = sign * apart[k] / length
-        return rows / SEPARATION_SIGMA, residual
+        known = np.array([distance for *_, distance in self.separations])
+        sigmas = self.sigma_scale * known if self.sigma_scale else Settings.sigma_position
+        return (rows.T / sigmas).T, residual / sigmas
 
     def select(self, chosen: Sequence[NDArray[np.generic]]) -> System:
         """Return chosen samples and their weights, by masks (N,) or indices (K,) for each set."""

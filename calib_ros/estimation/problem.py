@@ -282,7 +282,7 @@ class Problem(Shown):
             samples.append(samples_of(each, (position, self.sigma_orientation), self.sigma_pixel))
         present = {each.base for each in sets}
         apart = tuple(s for s in self.separations if {s[0], s[1]} <= present)
-        return System(tuple(samples), prior, apart)
+        return System(tuple(samples), prior, apart, self.sigma_scale)
 
     @cached_property
     def free(self) -> tuple[Parameter, ...]:

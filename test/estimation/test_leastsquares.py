@@ -15,7 +15,6 @@ from calib_ros.decision.comparison import residuals
 from calib_ros.estimation import leastsquares
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.leastsquares import (
-    SEPARATION_SIGMA,
     Normal,
     Prior,
     System,
@@ -176,18 +175,19 @@ def test_steps_that_gain_less_than_armijo_asks_for_are_damped(gains, first, monk
     assert np.flatnonzero(np.append(found, 1.0))[0] == first
 
 
-def test_rows_of_priors_and_separations_are_central_differences():
+@pytest.mark.parametrize(('checked', 'sigma'), [(0.0, 1e-4), (2e-5, 3e-5)])
+def test_rows_of_priors_and_separations_are_central_differences(checked, sigma):
     rng = np.random.default_rng(0)
     nominal = UR10E
     for name in ('base_A', 'base_B'):
         nominal = nominal.with_frame(name, random_frame(rng, 1.0))
     names = ['base_A.z', 'elbow_joint.theta', 'base_B.x', 'base_B.y', 'base_A.rx', 'elbow_joint.a']
     prior = Prior(nominal, {'elbow_joint.theta': 2e-3, 'elbow_joint.a': 1e-3}, noise=3.0)
-    system = System((), prior, (('base_A', 'base_B', 1.5),))
+    system = System((), prior, (('base_A', 'base_B', 1.5),), checked)
     chain = nominal.with_offsets({'elbow_joint.theta': 4e-3, 'elbow_joint.a': -2e-3})
     rows, left = system.extra_rows(chain, names)
     ends = [chain.frame(name).matrix[:3, 3] for name in ('base_A', 'base_B')]
-    apart = (1.5 - np.linalg.norm(ends[1] - ends[0])) / SEPARATION_SIGMA
+    apart = (1.5 - np.linalg.norm(ends[1] - ends[0])) / sigma
     np.testing.assert_allclose(left, [0.0, -6.0, 0.0, 0.0, 0.0, 6.0, apart])
     for k, name in enumerate(names):
         less, more = (

@@ -177,6 +177,24 @@ def test_sockets_at_another_distance_than_stated_are_refused(error):
     assert any(each.rule is Rule.SCALE for each in result.refusals) == bool(error)
 
 
+@pytest.mark.parametrize('seed', range(4))
+def test_an_arm_does_not_bend_to_a_distance_that_is_wrong(seed):
+    """Of six between four sockets one is 1 mm off; arms without errors were corrected by it."""
+    true, problem = cell(seed, noise=5e-5)
+    sets = problem.sets[::2]
+    places = [true.forward(each.joints)[:, :3, 3].mean(axis=0) for each in sets]
+    pairs = combinations(range(4), 2)
+    apart = [(i, j, float(np.linalg.norm(places[i] - places[j]))) for i, j in pairs]
+    apart[0] = (0, 1, apart[0][2] + 1e-3)
+    right = replace(true, base=None, tool=None)
+    known = [(sets[i].base, sets[j].base, distance) for i, j, distance in apart]
+    result = identify(
+        Problem(right, sets[0], more=sets[1:], separations=known, sigma_position=5e-5)
+    )
+    assert not result.accepted
+    assert difference(result.chain, true) < 0.1e-3
+
+
 def test_only_sockets_are_a_known_distance_apart():
     _, problem = cell(0)
     with pytest.raises(UnknownNameError, match=r'"base_9".*base_0_0'):
