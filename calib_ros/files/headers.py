@@ -146,5 +146,12 @@ def named_by_option(
     if len(given) > LONGEST // 3:  # a message would lose its middle
         short = {name: f'#{k}' for k, name in reversed([*enumerate(header, 1)])}
         given = option(found, [short.get(each, each) for each in found.values()])
-    another = 'Is it another arm (--chain)? ' * fewer
-    return f'{another}Columns of other names: {given}{more}'
+    return f'{_of_another_arm(names, lacking) * fewer}Columns of other names: {given}{more}'
+
+
+def _of_another_arm(names: Sequence[str], lacking: Sequence[str]) -> str:
+    """Return what a table with some of the joints may be."""
+    text = 'Is it another arm (--chain)? '
+    if [*names[4:]] == [*lacking]:  # as ABB names them
+        text += 'If q1 to q4 are a quaternion, give the joint values (--joints FILE). '
+    return text

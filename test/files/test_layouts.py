@@ -12,7 +12,7 @@ from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Expression, Layout, layout_of, load_layout
 from calib_ros.kinematics.chain import Joint
-from calib_ros.kinematics.chain_file import shared_files
+from calib_ros.kinematics.chain_file import load_chain, shared_files
 
 
 def test_later_columns_may_use_our_names_of_earlier_ones():
@@ -116,6 +116,18 @@ def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, name
     with pytest.raises(InputError) as told:
         loading.table(path, Chain('arm', 'standard', joints), Settings())
     assert str(told.value).endswith(proposed)
+
+
+@pytest.mark.parametrize(('given', 'told'), [(3, False), (4, True), (5, False)])
+def test_a_quaternion_in_place_of_the_joints_is_told(tmp_path, given, told):
+    """As ABB names it: q1 to q4 of six joints are hardly those of another arm."""
+    path = tmp_path / 'abb.csv'
+    header = [f'q{k}' for k in range(1, given + 1)] + ['x', 'y', 'z']
+    path.write_text(','.join(header) + '\n' + ','.join(['0.5'] * len(header)) + '\n')
+    with pytest.raises(InputError, match='Is it another arm') as refused:
+        loading.table(path, load_chain('abb_irb120'), Settings())
+    text = 'If q1 to q4 are a quaternion, give the joint values (--joints FILE)'
+    assert (text in str(refused.value)) is told
 
 
 def test_a_linear_axis_has_its_own_unit_in_the_header(tmp_path):
