@@ -277,8 +277,10 @@ def _check_header(columns: Columns, joints: int) -> None:
         refuse_separator(columns.path, columns.header)
         found = columns.theirs or columns.header
         expected = ', '.join([*needed[:joints], *POSITION])
+        lacks = ', '.join(missing)
+        expected = '' if lacks == expected else f'; expected {expected}'
         raise ColumnsError(
-            f'{columns.path} has no column {", ".join(missing)}; expected {expected} '
+            f'{columns.path} has no column {lacks}{expected} '
             '(or distance, plane, or location and socket); found '
             f'{listed(found)}. {named_by_option(found, missing, joints)}'
         )

@@ -107,6 +107,7 @@ FAULTS = [
       ('Test', ' test', 'validation')),
     (POINTS.replace(',q2,', ',other,'), 'no column q2; expected q1, q2, x, y, z .*other'),
     (POINTS.replace(',y,', ',other,'), 'no column y; expected q1, q2, x, y, z .*other'),
+    (POINTS.replace('q', 'a').replace('x,y,z', 'u,v,w'), r'no column q1, q2, x, y, z \(or dist'),
     (POSES.replace('qw', 'w'), 'no column qw;'),
     (
         POINTS.replace('\n-0.3', '\n\n\n\n-0.3').replace('4.5', 'bad'),
