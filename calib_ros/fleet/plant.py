@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import date, datetime, timedelta, timezone
@@ -135,7 +136,7 @@ def _chain(name: object, folder: Path, where: str, chains: dict[str, Chain]) -> 
 
 def _measured(value: object, folder: Path, where: str) -> tuple[Pattern, ...]:
     entries = value if isinstance(value, list) and value else [value]
-    found = []
+    found, root = [], Path(glob.escape(str(folder)))  # only what is written there is a pattern
     for entry in entries:
         if not isinstance(entry, dict):
             entry = {'files': entry}
@@ -147,7 +148,7 @@ def _measured(value: object, folder: Path, where: str) -> tuple[Pattern, ...]:
                 f'{where}: measured must be a pattern of bags or tables, a file or URL with *, '
                 f'or a list of them, not {files!r:.100}'
             )
-        found.append(Pattern(files if '://' in files else str(folder / files), session))
+        found.append(Pattern(files if '://' in files else str(root / files), session))
     return tuple(found)
 
 

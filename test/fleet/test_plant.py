@@ -7,6 +7,7 @@ import pytest
 
 from calib_ros.errors import ConfigError
 from calib_ros.fleet.plant import Pattern, parse_plant, read_plant
+from calib_ros.fleet.tasks import sources
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.settings import Settings
 
@@ -81,3 +82,12 @@ def test_mistakes_are_named(tmp_path, old, new, match):
 def test_no_plant(text):
     with pytest.raises(ConfigError, match='must be'):
         parse_plant(text, Path())
+
+
+def test_the_name_of_the_folder_is_no_pattern(tmp_path):
+    folder = tmp_path / 'hall [A]'
+    folder.mkdir()
+    (folder / '1.csv').touch()
+    (robot,) = parse_plant('robots: [{serial: a, chain: ur10e, measured: "*.csv"}]', folder)
+    (found,), wrong = sources(robot)
+    assert (found.url, wrong) == (str(folder / '1.csv'), {})
