@@ -125,10 +125,11 @@ class CalibrationSession:
         if not self.recording:
             return 0, NOT_RECORDING
         count, why = self._collector.capture(socket_place(socket) if socket else '')
-        before = len(self.samples)
+        fresh, before = self._collector.sampler.fresh, len(self.samples)
+        asked = {each.stamp_ns for each in fresh[len(fresh) - count :]}  # others: earlier stops
         self._pipeline.hand_over()
         self._settle(wait=True)
-        taken = len(self.samples) - before
+        taken = sum(each.stamp_ns in asked for each in self.samples[before:])
         why = self.state if JOINTS in self._filter.refused else why
         return taken, why if taken or not count else self.pictures.refused
 

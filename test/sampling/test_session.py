@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sessions import TRUE, UR5E, drive, samples, session, tracker
-from streams import POSE, TRACKER, pose, take
+from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, take
 
 from calib_ros.apply.simulation import random_frame
 from calib_ros.decision.comparison import compare
@@ -42,6 +42,25 @@ def test_restored_samples_come_first_and_are_as_good_as_new():
     first, second = made.identify(), whole.identify()
     for one, other in zip(first.parameters, second.parameters, strict=True):
         assert one == other
+
+
+@pytest.mark.parametrize(
+    ('until', 'answer', 'kept'),
+    [(0.8, (0, 'no measurement within this stop'), 1), (1.6, (1, ''), 2)],
+)
+def test_a_capture_counts_no_pose_of_an_earlier_stop(until, answer, kept):
+    """Which only it has ended; the tracker loses the target `until` then."""
+    made = CalibrationSession(UR5E)
+    motion = stops(UR5E.random_joints(2, np.random.default_rng(1)), 0.3, 0.8)
+    source, kind, seen = tracker()
+    times = np.arange(0.0, 1.6, 0.02)
+    for time, stamp, row in zip(times, stamps(times).tolist(), motion(times), strict=True):
+        take(made, of_joints(joint_state(stamp, UR5E.joint_names, row.tolist())))
+        if time < until:
+            take(made, (source, kind, seen(stamp, row)))
+    assert made.samples == []
+    assert made.capture() == answer
+    assert len(made.samples) == kept
 
 
 def renamed(tracked, frames):
