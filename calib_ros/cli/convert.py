@@ -44,14 +44,19 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.csv, 'csv2bag', 'table')
     chain = load_chain(options.chain)
     table = read_table(options.csv, len(chain.joints), common.sessions_of(options))
-    if len(table.fitted) != 1 or table.fitted[0].distances is not None or table.pairs:
+    every = [*table.fitted, *table.held_out]
+    oriented = any(each.oriented.any() for each in every)
+    if (
+        (len(table.fitted), len(table.held_out) > 1) != (1, False)
+        or any(x.socket or x.distances is not None or x.pixels is not None for x in every)
+        or not all((x.oriented == oriented).all() for x in every)
+    ):
         raise InputError(
-            'a bag can hold only poses or positions of one session and one target, '
-            'some of them to fit'
+            'a bag can hold only poses or positions of one session, device and target, all with '
+            'an orientation or none, and some of them to fit'
         )
     (fitted,) = table.fitted
     held_out = table.held_out[0] if table.held_out else fitted.select(np.zeros(0, int))
-    oriented = bool(fitted.oriented.any() or held_out.oriented.any())
     both = [(fitted.joints, held_out.joints), (fitted.positions, held_out.positions)]
     both += [(fitted.rotations, held_out.rotations)] if oriented else []
     rows = Observations.from_arrays(*map(np.concatenate, both))

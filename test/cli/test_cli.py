@@ -112,6 +112,19 @@ def test_a_table_and_its_bag_give_the_same(run, tmp_path, storage, held_out, ori
     assert samples['dropped'] == {}
 
 
+@pytest.mark.parametrize(
+    ('columns', 'cells'),
+    [('location,socket', ['A,1'] * 2), ('x,y,z,qx,qy,qz,qw', ['1,2,3,0,0,0,1', '1,2,3,,,,'])],
+)
+def test_what_a_bag_cannot_hold_is_not_made_up(run, tmp_path, columns, cells):
+    """Positions of a ball in a socket, orientations of poses without."""
+    rows = [f'{k},0,0,0,0,0,{row}' for k, row in enumerate(cells)]
+    table = tmp_path / 'table.csv'
+    table.write_text('\n'.join([f'q1,q2,q3,q4,q5,q6,{columns}', *rows]))
+    status, _, err = run('csv2bag', table, tmp_path / 'bag', '--chain', 'ur5e')
+    assert (status, 'a bag can hold only poses or positions of one' in err) == (1, True)
+
+
 def test_a_simulation_is_repeated_by_its_seed(run, tmp_path):
     truths = {}
     for name, seed in (('a', 1), ('b', 1), ('c', 2)):
