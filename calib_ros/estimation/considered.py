@@ -145,18 +145,21 @@ def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], f
     The travel of a prismatic joint is scaled by its ratio, which is added to the returned chain.
     """
     sets = [samples.observations for samples in system.sets]
-    if all(each.socket or each.plane for each in sets) and not system.separations:
+    sets = [each for each in sets if not (each.socket or each.plane)]
+    if not (sets or system.separations):
         return chain, {}, SCALE
     travels = [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
     chain = chain.with_effects(travels)
     names: list[str] = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
     names += [name for joint in chain.joints for name in joint.parameters if name.is_length]
-    scale = PRINTED if all(each.pixels is not None for each in sets) else SCALE
-    if all(each.distances is not None and not each.plane for each in sets):
-        scale = LARGEST_SCALE
-    if all(each.socket for each in sets):
+    scale = SCALE
+    if not sets:
         longest = max(distance for *_, distance in system.separations)
         scale = max(scale, Settings.sigma_position / longest)
+    elif all(each.pixels is not None for each in sets):
+        scale = PRINTED
+    elif all(each.distances is not None for each in sets):
+        scale = LARGEST_SCALE
     return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}, scale
 
 

@@ -15,9 +15,12 @@ from calib_ros.decision.plausibility import _apart
 from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation import start
+from calib_ros.estimation.considered import lengths_of
 from calib_ros.estimation.evidence import posterior_of
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import System, triangular_factor
+from calib_ros.estimation.levels import LARGEST_SCALE, PRINTED, SCALE
+from calib_ros.estimation.pixels import samples_of
 from calib_ros.estimation.samples import Samples, residual_arrays
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame, Joint
@@ -274,3 +277,23 @@ def test_touches_beside_poses_do_not_vouch_for_the_scale_of_the_device():
     met = Observations.touching(touched(true, PLANES[0], 12, rng), base='base_plane')
     result = identify(Problem(UR, seen, more=(met,)))
     assert [each.rule for each in result.refusals] == [Rule.SCALE]
+
+
+def test_the_scale_is_that_of_what_measures_lengths():
+    """Not of planes and sockets beside it; of these alone it is that of the bar."""
+    one = Observations.from_arrays(np.zeros((1, 6)), np.ones((1, 3)))
+    board = replace(one, pixels=np.zeros((1, 2)), points=np.zeros((1, 3)))
+    plane = replace(one, distances=np.zeros(1), plane=True)
+    socket, wire = replace(one, socket=True), replace(one, distances=np.ones(1))
+    bar = (('base', 'base_2', 0.05),)
+    for sets, apart, expected in (
+        ([one, board], (), SCALE),
+        ([board, plane], (), PRINTED),
+        ([wire, socket], (), LARGEST_SCALE),
+        ([socket, plane], bar, 2e-3),
+        ([socket, one], bar, SCALE),
+    ):
+        samples = tuple(samples_of(each, (1.0, 1.0), 1.0) for each in sets)
+        _, lengths, scale = lengths_of(UR, System(samples, None, apart))
+        assert (bool(lengths), scale) == (True, pytest.approx(expected))
+        assert not lengths_of(UR, System((samples_of(plane, (1.0, 1.0), 1.0),)))[1]
