@@ -21,6 +21,7 @@ from streams import (
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.sampling.account import lost
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import Source
 from calib_ros.settings import MODES, Settings
@@ -157,3 +158,8 @@ def test_every_measurement_is_accounted_for(plan, traffic):
     came, found = balance(session)
     assert came == found
     assert session.account().waiting == 0
+
+
+def test_the_name_of_a_frame_makes_no_loss():
+    cause = 'measurements: in frame "stamping press", not in frame_id "memory"'
+    assert lost('measurements', 100, {cause: 50}) == (0.0, '')
