@@ -66,11 +66,22 @@ def cell_and_child(**parameters):
         def hears():  # that the peer knows of the child does not say that it hears the peer
             for publisher, probe in probes:
                 publisher.publish(probe)
-            values = {v.key: v.value for r in reports[-1:] for v in r.status[0].values}
-            return all(int(values.get(stream, 0)) for stream in ('joint states', 'poses'))
+            return reports and min(heard(reports[-1]))
 
         cell.spin_until(hears)
         yield cell, child
+
+
+def heard(report):
+    """Return how many joint states and poses a node has received."""
+    values = {v.key: int(v.value) for v in report.status[0].values if v.value.isdigit()}
+    return [values.get(stream, 0) for stream in ('joint states', 'poses')]
+
+
+def all_heard(cell):
+    """Wait until a child has received what was played: nothing more between two reports."""
+    reports = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    cell.spin_until(lambda: len(reports) > 1 and heard(reports[-1]) == heard(reports[-2]))
 
 
 def test_a_node_killed_in_its_first_run_goes_on_with_all_samples(monkeypatch, tmp_path, recording):
@@ -92,6 +103,7 @@ def test_a_node_killed_in_its_first_run_goes_on_with_all_samples(monkeypatch, tm
         assert f'resumed 10 poses of {path}' in output
         cell.play(part(recording, 12.0, 24.0))
         cell.spin_until(lambda: len(samples_in(folder)) == 20)
+        all_heard(cell)
         answer = cell.done('identify')
         assert '22 poses' in answer.message  # two stops waited when it was killed
     expected = direct(recording)
