@@ -43,6 +43,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import DELAY, IN_A_FRAME, LENS_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXACT, EXCEPTION, Settings
+from calib_ros.shown import some
 
 HARMFUL = 0.15
 """Probability of harm by the device's scale at which a result is refused: of 630 good ones 23 are;
@@ -75,14 +76,15 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     if imitated:
         refusals.insert(0, Reason(Rule.MISTAKE, lens))
         lens = ''
-    if another and (unlike := _sessions(problem, result)):
-        refusals.insert(0, Reason(Rule.MISTAKE, unlike))
+    if another and (several := _sessions(problem, result)):
+        refusals.insert(0, Reason(Rule.MISTAKE, several))
     if refusals and sigmas:
         first = another and not imitated
         refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
         sigmas = ''
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
-    found = (lens, board, coupled, _level(problem, result), motion, _order(problem), sigmas)
+    unlike, level = _another_type(problem, result), _level(problem, result)
+    found = (unlike, lens, board, coupled, level, motion, _order(problem), sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
     return _lag(problem, replace(result, remarks=remarks, refusals=tuple(refusals)))
 
@@ -133,6 +135,17 @@ def _sessions(problem: Problem, result: Identification) -> str:
         f'one arm does not fit all sessions: alone each fits {result.noise.position / worst:.1f} '
         'times as well or better. Is it the same robot, did nothing happen to it in between, and '
         'are the devices true to scale? Identify each alone (--session) and compare them'
+    )
+
+
+def _another_type(problem: Problem, result: Identification) -> str:
+    """Return that lengths differ more than those of one type do; a linear joint's zero may."""
+    most = problem.largest_length / 5.0
+    zeros = {joint.driven for joint in problem.chain.joints}
+    far = [p.name for p in result.parameters if p.beyond(most, np.inf) and p.name not in zeros]
+    return bool(far) * (
+        f'{", ".join(some(far))} further than {1e3 * most:g} mm from nominal: is the chain that '
+        'of the arm measured (type, size and generation)?'
     )
 
 

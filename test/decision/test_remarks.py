@@ -2,21 +2,37 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which implausible results are refused, and in which order reasons are told, part by part."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from fits import UR10E as UR
 
+from calib_ros.apply.simulation import measure
 from calib_ros.decision import plausibility
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import TELLING
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.lens import Lens
+
+
+@pytest.mark.parametrize(('joint', 'off'), [(2, 0.02), (2, 0.008), (0, 0.02)])
+def test_lengths_of_another_type_are_told(joint, off):
+    """As of an iiwa 14 whose chain is that of an iiwa 7; the zero of a rail may be anywhere."""
+    rail = load_chain('ur10e_on_linear_axis')
+    name = rail.joints[joint].parameters[0 if joint else 2]
+    rng = np.random.default_rng(0)
+    seen = measure(rail.with_offsets({name: off}), rail.random_joints(60, rng), rng, 1e-4, 3e-4)
+    result = identify(Problem(replace(rail, base=None, tool=None), seen))
+    told = [each for each in result.remarks if 'is the chain that of' in each]
+    assert bool(told) == (joint > 0 and off > 0.01)
+    assert all(each.startswith(f'{name} further than 10 mm from nominal') for each in told)
 
 
 @pytest.mark.parametrize(
@@ -191,6 +207,7 @@ class Judged:
         ({'given': 'mistake', 'sigmas': 's'}, False, ['mistake', 's'], []),
         ({'coupled': True, 'motion': 'fast', 'order': 'one way'}, True, [], ['fast', 'one way']),
         ({'level': 'tool.z', 'motion': 'fast'}, True, [], ['tool.z', 'fast']),
+        ({'type': 'joint_3.d', 'lens': 'lens'}, True, [], ['joint_3.d', 'lens']),
     ],
 )
 def test_what_explains_a_refusal_comes_before_it(found, another, refused, remarked, monkeypatch):
@@ -201,6 +218,7 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
         '_sigmas': found.get('sigmas', ''),
         '_scale': [Reason(Rule.SCALE, found['scale'])] if 'scale' in found else [],
         '_sessions': found.get('sessions', ''),
+        '_another_type': found.get('type', ''),
         '_level': found.get('level', ''),
         '_motion': found.get('motion', ''),
     }
