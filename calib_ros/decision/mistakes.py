@@ -23,7 +23,17 @@ from calib_ros.decision.lost_rows import dead, in_any_order, repeating, row_loss
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import FIRST, ORIENTATIONS, hidden, suspects
-from calib_ros.decision.trials import Trial, in_frames, misses, refined, trial_of
+from calib_ros.decision.trials import (
+    Trial,
+    among,
+    fits_each_side,
+    in_frames,
+    largest_of,
+    misses,
+    refined,
+    trial_of,
+    unlike,
+)
 from calib_ros.decision.undoing import Sets, Suspect
 from calib_ros.estimation.levels import (
     ALIKE,
@@ -87,9 +97,16 @@ def with_mistake(problem: Problem, result: Identification) -> Identification:
 
     It becomes the first refusal, in place of those that follow from it with the same advice: a
     held frame found wrong by the misfit, or no gain beyond the uncertainty. But another arm, and
-    orientations that do not fit, only give a remark if nothing else refuses the result.
+    orientations that do not fit, only give a remark if nothing else refuses the result. A move
+    that leaves one side out explains all if the arm fits both: it comes first then.
     """
-    found = explained(problem) if _suspicious(problem, result) else None
+    found, step = None, result.step
+    if _suspicious(problem, result):
+        if step and step.unused and fits_each_side(problem, problem.sets[step.set], step.stamp_ns):
+            rule = step.reason.rule
+            first = sorted(result.refusals, key=lambda each: each.rule is not rule)
+            return replace(result, refusals=tuple(first))
+        found = explained(problem)
     if found is None:
         return result
     if result.refusals or found.alone:
@@ -134,9 +151,9 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
     )
     chain, where = replace(problem.chain, base=base, tool=tool), ''
     if not any(each.socket for each in sets):
-        sets, where = _unlike(problem, chain, sets)
+        sets, where = unlike(problem, chain, sets)
     given = in_frames(problem, chain, sets)
-    if given is None or (far and given.error <= _largest(problem)):
+    if given is None or (far and given.error <= largest_of(problem)):
         return None
     missing = None if _of_images(problem) else dead(chain, given.sets)
     found = (
@@ -164,7 +181,7 @@ def explained_alone(problem: Problem, chain: Chain) -> Explained | None:
     sets = [each for each in problem.all_sets if each.distances is None and each.pixels is None]
     for each in sets:
         if found := _of_rows(problem, chain, each) or _of_repeats(problem, chain, each):
-            return _told(problem, replace(found, where=_among(sets, each) + found.where))
+            return _told(problem, replace(found, where=among(sets, each) + found.where))
     return None
 
 
@@ -173,7 +190,7 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | 
 
     Its frames hold for them too, so few rows tell as much as many.
     """
-    far = misses(chain, seen, flange(chain, seen)) > _largest(problem)
+    far = misses(chain, seen, flange(chain, seen)) > largest_of(problem)
     rows = np.flatnonzero(far)
     if len(rows) < LEAST_ASIDE:
         return None
@@ -190,30 +207,6 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | 
     named = (replace(each, remedy=alike.format(each.remedy)) for each in found.suspects)
     where = f'in {poses}{among} alone, '
     return replace(found, suspects=tuple(named), where=where)
-
-
-def _unlike(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
-    """Return the largest set that the arm does not explain, and its name if it explains others.
-
-    Another device or session may have other units or conventions.
-    """
-    trials = [in_frames(problem, chain, (each,)) for each in sets] if len(sets) > 1 else []
-    errors = np.array([np.inf if trial is None else trial.error for trial in trials])
-    wrong = np.flatnonzero(errors > _largest(problem)).tolist()
-    worst = max(wrong or range(len(sets)), key=lambda k: len(sets[k]))
-    if not 0 < len(wrong) < len(sets):
-        return (sets[worst],), ''
-    return (sets[worst],), _among(sets, sets[worst])
-
-
-def _among(sets: Sequence[Observations], one: Observations) -> str:
-    """Return which of several sets one is, by the frames that not all share."""
-    if len(sets) == 1:
-        return ''
-    shared = set.intersection(*({each.base, each.tool} for each in sets))
-    own = ', '.join(sorted({one.base, one.tool} - shared))
-    which = f'with {own}' if own else f'of {len(one)} poses'
-    return f'in the measurements {which} alone, '
 
 
 def _of_images(problem: Problem) -> bool:
@@ -239,7 +232,7 @@ def _named(
     for found, each in sorted(rough, key=lambda one: one[0].share)[:TRIED]:
         polished = refined(problem, found)
         # an arm in mm fits places in mm, and is off by metres
-        if polished.error <= _largest(problem):
+        if polished.error <= largest_of(problem):
             tried.append((polished, each))
     if not tried:
         return None
@@ -255,16 +248,11 @@ def _named(
     return Explained(tuple(unlike.values())[:SEVERAL], given.error, best.error)
 
 
-def _largest(problem: Problem) -> float:  # [m]
-    return problem.largest_error + LEVER * problem.largest_angle / 3.0
-
-
 def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:
     """Return a row missing in one of two tables side by side, if that explains all."""
     if problem.of_messages or len(sets) > 1 or sets[0].socket or sets[0].pixels is not None:
         return None
-
-    found = row_loss(problem, chain, _moved(problem, sets[0], 0), _largest(problem))
+    found = row_loss(problem, chain, _moved(problem, sets[0], 0), largest_of(problem))
     if found is None:
         return None
     what, error = found
@@ -275,7 +263,7 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> 
 
 
 def _of_repeats(problem: Problem, chain: Chain, seen: Observations) -> Explained | None:
-    odd = repeating(chain, seen, _largest(problem), problem.of_messages)
+    odd = repeating(chain, seen, largest_of(problem), problem.of_messages)
     return None if odd is None else Explained((odd,), np.nan, np.nan)
 
 
@@ -299,11 +287,11 @@ def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> E
         for part in parts
     ]
     for one in (given, *trials):
-        if one is None or one.error > _largest(problem):
+        if one is None or one.error > largest_of(problem):
             continue
         if found := _of_rows(problem, one.chain, whole):
             return found
-    most = min(_largest(problem), NEARER * given.error)
+    most = min(largest_of(problem), NEARER * given.error)
     if not enough or any(one is None or one.error > most for one in trials[-2:]):
         return None
     two = Suspect(
@@ -345,7 +333,7 @@ def _several(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
         return None
     few = given.sets
     options = [each for each in suspects(chain, few, _of_images(problem)) if each.part]
-    largest, share = min(_largest(problem), NEARER * given.error), NEARER * min(given.share, 1.0)
+    largest, share = min(largest_of(problem), NEARER * given.error), NEARER * min(given.share, 1.0)
     least = given.share
     kept: list[tuple[Suspect, ...]] = [()]
     for number in range(SEVERAL + 1):  # several of joints, one of the poses

@@ -83,8 +83,8 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
         refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
         sigmas = ''
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
-    unlike, level = _another_type(problem, result), _level(problem, result)
-    found = (unlike, lens, board, coupled, level, motion, _order(problem), sigmas)
+    level, other = _level(problem, result), _another_type(problem, result) if another else ''
+    found = (other, lens, board, coupled, level, motion, _order(problem), sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
     return _lag(problem, replace(result, remarks=remarks, refusals=tuple(refusals)))
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -80,6 +81,50 @@ def in_frames(problem: Problem, chain: Chain, sets: Sets) -> Trial | None:
     """Return the arm as given, in the frames that suit it best."""
     given = trial_of(chain, tuple(each.spread() for each in sets))
     return None if given is None else refined(problem, given)
+
+
+def largest_of(problem: Problem) -> float:
+    """Return the largest error [m] of a faulty arm, with that of its orientation."""
+    return problem.largest_error + LEVER * problem.largest_angle / 3.0
+
+
+def fits_each_side(problem: Problem, seen: Observations, stamp_ns: int) -> bool:
+    """Tell whether the arm as given fits both samples before a stamp and those from there on.
+
+    Each in frames of their own; false if these explain too few samples anyway.
+    """
+    if seen.pixels is not None or seen.distances is not None or seen.socket:
+        return False
+    arm = replace(problem.chain, base=None, tool=None, frames=())
+    alone, before = replace(seen, base='base', tool='tool'), seen.stamps_ns < stamp_ns
+    if min(np.count_nonzero(before), np.count_nonzero(~before)) < 2 * IN_A_FRAME:
+        return False
+    sides = [in_frames(problem, arm, (alone.select(rows),)) for rows in (before, ~before)]
+    return all(side is not None and side.error <= largest_of(problem) for side in sides)
+
+
+def unlike(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
+    """Return the largest set that the arm does not explain, and its name if it explains others.
+
+    Another device or session may have other units or conventions.
+    """
+    trials = [in_frames(problem, chain, (each,)) for each in sets] if len(sets) > 1 else []
+    errors = np.array([np.inf if trial is None else trial.error for trial in trials])
+    wrong = np.flatnonzero(errors > largest_of(problem)).tolist()
+    worst = max(wrong or range(len(sets)), key=lambda k: len(sets[k]))
+    if not 0 < len(wrong) < len(sets):
+        return (sets[worst],), ''
+    return (sets[worst],), among(sets, sets[worst])
+
+
+def among(sets: Sequence[Observations], one: Observations) -> str:
+    """Return which of several sets one is, by the frames that not all share."""
+    if len(sets) == 1:
+        return ''
+    shared = set.intersection(*({each.base, each.tool} for each in sets))
+    own = ', '.join(sorted({one.base, one.tool} - shared))
+    which = f'with {own}' if own else f'of {len(one)} poses'
+    return f'in the measurements {which} alone, '
 
 
 def _nearest(chain: Chain, each: Observations, arm: FloatArray, rows: Flags) -> Trial | None:

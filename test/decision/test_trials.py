@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from fits import NOISE, UR10E, measured_arm
 
-from calib_ros import Problem
-from calib_ros.decision.trials import Trial, misses, refined, trial_of
+from calib_ros import Observations, Problem, identify, load_chain
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.decision.reasons import Rule
+from calib_ros.decision.trials import Trial, fits_each_side, misses, refined, trial_of
 from calib_ros.estimation.start import flange
 
 
@@ -64,3 +66,23 @@ def test_gross_errors_do_not_spoil_the_refinement():
     for trial in (rough, turned):
         found = refined(Problem(UR10E, seen, sigma_position=NOISE[0]), trial)
         assert misses(found.chain, seen, arm)[8:].max() < 1e-6
+
+
+def test_two_sessions_in_one_are_no_mistakes():
+    """Of two days of a measured Meca500, cm, signs, zeros and orders of joints were told."""
+    nominal, rng = load_chain('meca500'), np.random.default_rng(0)
+    true, days = faulty(nominal, Cell(), rng), []
+    for count, home in ((40, (5, -37, 28, 0, 27, 5)), (50, (4, 14, 38, -89, -88, 78))):
+        there = replace(true, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.05))
+        q = np.radians(home + rng.normal(size=(count, 6)) * (10, 10, 8, 15, 12, 35))
+        days.append(measure(there, q, rng, 2e-5, 2e-4, False))
+    given = (np.concatenate([getattr(e, k) for e in days]) for k in ('joints', 'positions'))
+    problem = Problem(nominal, Observations.from_arrays(*given, None))
+    refused = identify(problem).refusals
+    assert refused[0].rule is Rule.MOVED
+    assert Rule.MISTAKE not in {each.rule for each in refused}
+    seen, begin = problem.observations, problem.observations.stamps_ns[40]
+    assert fits_each_side(problem, seen, begin)
+    wrong = np.where(seen.stamps_ns < begin, 100.0, 1.0)[:, np.newaxis] * seen.positions
+    assert not fits_each_side(problem, replace(seen, positions=wrong), begin)
+    assert not fits_each_side(problem, seen, seen.stamps_ns[7])
