@@ -188,9 +188,9 @@ def of_journal(
                 if file.tell() == size and is_whole(rest, len(columns(joints))):
                     whole, end, rest = whole + end + rest, b'\n', b''
                 if end:
-                    some = [each + b'\n' for each in whole.split(b'\n')]
-                    parts += _rows(path, joints, some, lines - 1, damaged)
-                    lines += len(some)
+                    ended = [each + b'\n' for each in whole.split(b'\n')]
+                    parts += _rows(path, joints, ended, lines - 1, damaged)
+                    lines += len(ended)
                 if len(rest) > LARGEST_TEXT:
                     raise InputError(f'{path}, line {lines + 1} is incomplete: is it a journal?')
                 progress(min(file.tell() / size, 1.0))
