@@ -48,6 +48,7 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     oriented = any(each.oriented.any() for each in every)
     if (
         (len(table.fitted), len(table.held_out) > 1) != (1, False)
+        or len({(x.base, x.tool, x.inverse) for x in every}) > 1
         or any(x.socket or x.distances is not None or x.pixels is not None for x in every)
         or not all((x.oriented == oriented).all() for x in every)
     ):

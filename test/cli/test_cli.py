@@ -114,10 +114,14 @@ def test_a_table_and_its_bag_give_the_same(run, tmp_path, storage, held_out, ori
 
 @pytest.mark.parametrize(
     ('columns', 'cells'),
-    [('location,socket', ['A,1'] * 2), ('x,y,z,qx,qy,qz,qw', ['1,2,3,0,0,0,1', '1,2,3,,,,'])],
+    [
+        ('location,socket', ['A,1'] * 2),
+        ('x,y,z,qx,qy,qz,qw', ['1,2,3,0,0,0,1', '1,2,3,,,,']),
+        ('x,y,z,device,split', ['1,2,3,A,train', '1,2,3,B,test']),
+    ],
 )
 def test_what_a_bag_cannot_hold_is_not_made_up(run, tmp_path, columns, cells):
-    """Positions of a ball in a socket, orientations of poses without."""
+    """Positions of a ball in a socket, orientations of poses without, one device of two."""
     rows = [f'{k},0,0,0,0,0,{row}' for k, row in enumerate(cells)]
     table = tmp_path / 'table.csv'
     table.write_text('\n'.join([f'q1,q2,q3,q4,q5,q6,{columns}', *rows]))
