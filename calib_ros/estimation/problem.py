@@ -165,8 +165,9 @@ class Problem(Shown):
             # priors in a wider pattern pass frames by
             if all(of_frames) or (pattern in self.fixed and any(of_frames)):
                 raise ConfigError(
-                    'a frame is known or unknown as a whole, without a prior: if it is known, '
-                    f'give it in the chain file with "fixed: true" instead of "{pattern}"'
+                    'a frame is known or unknown as a whole, without a prior, and its delay is '
+                    'always fitted: if it is known, give it in the chain file with "fixed: true" '
+                    f'instead of "{pattern}"'
                 )
 
     def _check_effects(self) -> None:

@@ -214,10 +214,15 @@ def led(
     values, number = values.copy(), {name: k for k, name in enumerate(chain.joint_names)}
     for k, end in chain.held.items():
         values[k] = 0.0 if rates else end
-    for name, value in chain.effects if couplings else ():
-        joint, _, leader = name.partition('.coupling_')
-        if leader and number[joint] in chain.held:
-            values[number[joint]] += value * values[number[leader]]
+    if not couplings:
+        return values
+    still = values
+    for _ in chain.held:  # one may lead another
+        leaders, values = values, still.copy()
+        for name, value in chain.effects:
+            joint, _, leader = name.partition('.coupling_')
+            if leader and number[joint] in chain.held:
+                values[number[joint]] += value * leaders[number[leader]]
     return values
 
 

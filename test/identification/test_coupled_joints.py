@@ -14,10 +14,11 @@ from calib_ros import CalibrationSession, Problem, Settings, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
-from calib_ros.kinematics.effects import basis
+from calib_ros.kinematics.effects import basis, led
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.joint import Joint
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 
 Y = (0, 1, 0)
@@ -67,6 +68,19 @@ def test_effects_and_delays_take_coupled_joints_where_they_are_led(rng):
     later, earlier = (chain.forward(q + step * speeds)[:, :3, 3] for step in (1e-6, -1e-6))
     moved = ErrorModel(chain, ['base.delay']).jacobian(q, velocity=speeds)[:, :3, 0]
     np.testing.assert_allclose(moved, (earlier - later) / 2e-6, rtol=0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize('order', [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+def test_a_led_joint_may_lead_another(order):
+    """In whatever order the chain file names the couplings."""
+    names = ('b.coupling_a', 'c.coupling_b', 'd.coupling_c')
+    held = (Joint(name, lower=0.0, upper=0.0) for name in 'bcd')
+    given = tuple((names[k], -1.0) for k in order)
+    chain = Chain('arm', 'standard', (Joint('a'), *held), effects=given)
+    expected = np.array([[0.5], [-0.5], [0.5], [-0.5]])
+    reported = np.array([[0.5], [0.1], [0.2], [0.3]])
+    np.testing.assert_allclose(led(chain, reported), expected, atol=1e-12)
+    np.testing.assert_allclose(chain.effective(reported), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize('changes', [(0.0, 0.0), (-2e-3, 0.0), (1e-3, -1e-3)])
