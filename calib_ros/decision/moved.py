@@ -26,7 +26,7 @@ class Step:
     ('m') or, if that weighs more, orientations ('rad'); of a joint that of its zero. `share` is
     its share of the squared residuals beyond that of as many useless parameters. If all
     measurements on one side are outliers, `unused` says which: the fit of frames is not affected.
-    If the arm's places before and after lie `apart`, errors of the arm look like a step.
+    If the arm's places before and after lie `apart`, its errors may look like a step of that size.
     """
 
     what: str

@@ -24,6 +24,7 @@ import numpy as np
 from calib_ros.decision.drift import gain_of, inverse_root, slow_cosines
 from calib_ros.decision.imitations import LEAST, Imitation
 from calib_ros.decision.moved import FRAMES, Step, thing_of
+from calib_ros.decision.trials import largest_of
 from calib_ros.estimation.configurations import stops
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import SOME
@@ -320,6 +321,8 @@ class _Scan:
         weights = np.concatenate([self._weights[k] for k in group.sets])
         later = np.concatenate(after)
         sides = ('before that', ~later), ('from there on', later)
+        most = largest_of(problem) if unit == 'm' else problem.largest_angle
+        joints = np.concatenate([each.joints for each in sets])
         unused = [where for where, side in sides if found.stop and not weights[side].any()]
         seen = problem.sets[of_set]
         return Step(
@@ -334,7 +337,7 @@ class _Scan:
             share=found.share,
             unused=''.join(unused),
             image=None if seen.pixels is None else int(seen.images[sample]),
-            apart=_apart(np.concatenate([each.joints for each in sets]), later),
+            apart=size <= most and _apart(joints, later),
             held=not found.stop,
         )
 
