@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -47,7 +47,7 @@ class Suspect:
 
 def joints_by(matrix: FloatArray, shift: FloatArray | float = 0.0) -> DataChange:
     """Return the change of joint values by a matrix (n, n), then a shift (n,) or constant."""
-    return lambda each: replace(each, joints=each.joints @ matrix.T + shift)
+    return lambda each: each.changed(joints=each.joints @ matrix.T + shift)
 
 
 def of_kind(chain: Chain, kind: str, size: float) -> DataChange:
@@ -63,22 +63,22 @@ def lengths(chain: Chain, size: float) -> tuple[DataChange, DataChange]:
 def scaled(size: float, axis: int | None = None) -> DataChange:
     """Return the change of positions, or of one coordinate, by a factor."""
     sizes = np.where(np.isin(np.arange(3), range(3) if axis is None else axis), size, 1.0)
-    return lambda each: replace(each, positions=sizes * each.positions)
+    return lambda each: each.changed(positions=sizes * each.positions)
 
 
 def in_axes(matrix: FloatArray) -> DataChange:
     """Return the change of positions to the axes in the rows of a matrix (3, 3)."""
-    return lambda each: replace(each, positions=each.positions @ matrix.T)
+    return lambda each: each.changed(positions=each.positions @ matrix.T)
 
 
 def with_turn(turn: Turn) -> DataChange:
     """Return the change of rotations by a function of these (N, 3, 3)."""
-    return lambda each: replace(each, rotations=turn(each.rotations))
+    return lambda each: each.changed(rotations=turn(each.rotations))
 
 
 def mirrored(each: Observations) -> Observations:
     """Return the measurements with the y axis of the device reversed."""
     mirror = np.diag([1.0, -1.0, 1.0])
-    return replace(
-        each, positions=each.positions @ mirror, rotations=mirror @ each.rotations @ mirror
+    return each.changed(
+        positions=each.positions @ mirror, rotations=mirror @ each.rotations @ mirror
     )

@@ -162,10 +162,17 @@ class Observations(Shown):
         plain = cls.from_arrays(joints, np.zeros((len(joints), 3)))
         return replace(plain, distances=heights, plane=True, base=base, tool=tool)
 
+    def changed(self, **values: Any) -> Observations:
+        """Return the pairs with other values of some fields, unchecked."""
+        found = object.__new__(Observations)
+        vars(found).update(
+            {name: vars(self)[name] for name in self.__dataclass_fields__}, **values
+        )
+        return found
+
     def select(self, mask: NDArray[np.generic] | slice) -> Observations:
         """Return the pairs of a mask (N,), indices (K,) or a slice, unchecked."""
-        chosen = object.__new__(Observations)
-        vars(chosen).update({name: vars(self)[name] for name in self.__dataclass_fields__})
+        chosen = self.changed()
         count = len(self.stamps_ns[mask])
         for name, array in self._arrays().items():
             alike = array.strides[0] == 0  # keep broadcast arrays so
