@@ -53,7 +53,8 @@ class Hearing:
     latched: bool = False  # true if it is published only once
     lost: int = 0  # messages lost in transit, by DDS
     reported: int = 0  # the last total reported by DDS
-    full: int = 0  # how often the queue was full
+    full: int = 0  # how often the queue was full, and messages were lost
+    number: int = 0  # of the last message, as its publisher counts them
     lost_before: int = 0
     losing: bool = False  # true if either grew between the last two looks
 
@@ -67,6 +68,19 @@ class Hearing:
         self.reported = total
         if more < 2**30:  # two weeks of 1 kHz
             self.lost += more
+
+    def note_queue(self, numbers: Sequence[int | None], depth: int) -> None:
+        """Count messages from a queue, and whether it lost those before them, or any beyond.
+
+        A full queue that lost none shows the next number; without numbers, or of publishers that
+        count by turns, it is taken to have lost some.
+        """
+        if not numbers:
+            return
+        self.count += len(numbers)
+        lost = numbers[0] != self.number + 1
+        self.full += len(numbers) >= QUEUE or (lost and len(numbers) >= depth)
+        self.number = numbers[-1] or 0
 
     def look(self, now: float, span: float) -> None:
         """Note how many messages arrived in the last `span`."""
@@ -125,9 +139,9 @@ class Inputs:
         come = []
         for subscription, (stream, hearing) in self._inputs.items():
             found = _waiting(subscription)
-            hearing.count += len(found)
-            hearing.full += len(found) >= min(subscription.qos_profile.depth, QUEUE)
-            come += [(stamp, stream, data) for stamp, data in found]
+            numbers = [info['publication_sequence_number'] for info, _ in found]
+            hearing.note_queue(numbers, subscription.qos_profile.depth)
+            come += [(info['received_timestamp'], stream, data) for info, data in found]
         come.sort(key=itemgetter(0))
         return [(stream, data) for _, stream, data in come]
 
@@ -308,14 +322,15 @@ def deserialised(data: bytes, name: str) -> Any:
     return deserialize_message(data, _message_type(name))
 
 
-def _waiting(subscription: Subscription) -> list[tuple[int, Any]]:
+def _waiting(subscription: Subscription) -> list[tuple[dict[str, Any], Any]]:
+    """Return the messages that wait, each with what the middleware tells of it."""
     found = []
     with subscription.handle:
         for _ in range(QUEUE):
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
                 break
-            found.append((taken[1]['received_timestamp'], taken[0]))
+            found.append((taken[1], taken[0]))
     return found
 
 

@@ -96,6 +96,27 @@ def test_a_queue_that_was_full_is_told(tmp_path, recording):
         cell.spin_until(lambda: 'are lost' not in heard[-1].status[0].message)
 
 
+def test_a_short_queue_that_loses_nothing_is_no_loss(tmp_path, recording):
+    """With depth 1 each message was told as lost ones."""
+    override = {'qos_overrides./joint_states.subscription.depth': 1}
+    with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        publisher = cell.publisher(JointState, 'joint_states')
+
+        def play(burst, count):
+            for k in range(0, len(recording.joints) // 20, burst):
+                for message in joint_messages(recording)[k : k + burst]:
+                    publisher.publish(message)
+                before = cell.node.session.received['joints']
+                cell.spin_until(lambda n=before: cell.node.session.received['joints'] > n)
+            del heard[:]
+            cell.spin_until(lambda: heard)
+            assert (int(values_of(heard[-1])['queue of /joint_states full']) > 0) == count
+
+        play(1, False)
+        play(2, True)
+
+
 def test_messages_of_seconds_wait_while_the_node_is_busy(tmp_path, recording):
     """Joint values in degrees let the node judge poses for five seconds: a fifth was lost."""
     override = {'qos_overrides./joint_states.subscription.reliability': 'reliable'}
