@@ -83,6 +83,11 @@ class Archive:
         return bool(self.error and (self._waiting or self._journal))
 
     @property
+    def path(self) -> Path:
+        """Return the path of the journal, begun or not."""
+        return self._path
+
+    @property
     def journal(self) -> Path | None:
         """Return the path of the journal, if any."""
         return None if self._journal is None else self._journal.path
@@ -185,9 +190,9 @@ class Archive:
             write_files(partial, files)
         return folder
 
-    def note(self, text: str, ending: str = '.txt') -> Path | None:
-        """Write the result of the last identification beside the journal; return its path."""
-        path = self._path.with_suffix(f'.identified{ending}').absolute()
+    def note(self, text: str, journal: Path, ending: str = '.txt') -> Path | None:
+        """Write the result of the last identification beside its journal; return its path."""
+        path = journal.with_suffix(f'.identified{ending}').absolute()
         try:
             write_file(path, text, overwrite=True)
         except (OSError, InputError):

@@ -127,10 +127,12 @@ class Identifying:
         self.observability = ''
         self._advice = ''  # of the last identification, most serious first
         self._report: Path | None = None  # of the last identification, if it was refused
+        self._journal = archive.path  # of the poses of the last identification
 
     def snapshot(self, inputs: Inputs) -> Snapshot:
         """Return the current problem and its context."""
         session, self._advice, self._report = self._session, '', None
+        self._journal = self._archive.path
         try:
             problem = session.problem()
         except InputError as err:
@@ -203,7 +205,7 @@ class Identifying:
     def _keep_report(self, page: Callable[[], str | None]) -> None:
         try:
             text = page()
-            self._report = (text and self._archive.note(text, '.html')) or None
+            self._report = (text and self._archive.note(text, self._journal, '.html')) or None
         except Exception as err:  # the answer is sent without the page
             self._node.get_logger().warning(
                 f'the report of the refusal is not written: {trouble(err)}'
@@ -218,7 +220,7 @@ class Identifying:
         """
         success, text = answer
         if len(text) > ANSWER_LENGTH:
-            path = self._archive.note(f'{text}\n')
+            path = self._archive.note(f'{text}\n', self._journal)
             path = self._report or path
             more = f' ... full text: {path.name if path else "in the log"}'
             kept = [each for each in (KEEP, NOT_FILED) if each in text]

@@ -74,7 +74,7 @@ def test_robots_with_similar_and_with_long_names_have_files_of_their_own(tmp_pat
         archive.close()
         assert not archive.error
         archive.save(f'calibration: {k}', 'settings: none')
-        assert archive.note('identified') is not None
+        assert archive.note('identified', archive.path) is not None
     for k, robot in enumerate(robots):
         assert stamps(tmp_path, robot) == [k]
         newest = open_archive(tmp_path, robot).newest_calibration()
@@ -317,7 +317,7 @@ def test_a_note_that_cannot_be_written_is_none(tmp_path):
     archive = open_archive(tmp_path)
     archive.add(sample(1))
     archive.journal.with_suffix('.identified.txt').mkdir()
-    assert archive.note('text') is None
+    assert archive.note('text', archive.path) is None
 
 
 @pytest.mark.parametrize('how', ['deleted', 'folder deleted', 'replaced'])

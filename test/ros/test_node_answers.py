@@ -77,7 +77,7 @@ def test_an_answer_is_cut_between_verdict_and_advice(verdict, middle, advice):
 
 def test_an_accepted_answer_keeps_its_hint_whole_and_says_how_to_save(cell, tmp_path):
     identifying = cell.node._identifying
-    cell.node._archive._path = tmp_path / 'ur10e_20260102T030405000006Z.csv'
+    identifying._journal = tmp_path / 'ur10e_20260102T030405000006Z.csv'
     verdict, hint = 'accepted: 40 poses, RMS 1.911 -> 0.0053 mm', 'J moves one way: mix the order'
     identifying._advice = hint
     rest = f'valid; {"not identifiable, " * 20}note: {hint}{KEEP}{NOT_FILED}: no room'
@@ -94,8 +94,8 @@ def test_an_accepted_answer_keeps_its_hint_whole_and_says_how_to_save(cell, tmp_
 @pytest.mark.parametrize('folder', ['data', 'of a cell with a long name ' * 9])
 def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path, folder):
     identifying = cell.node._identifying
-    cell.node._archive._path = tmp_path / folder / 'ur10e+SN-0042_20260102T030405000006Z.csv'
-    cell.node._archive._path.parent.mkdir()
+    identifying._journal = tmp_path / folder / 'ur10e+SN-0042_20260102T030405000006Z.csv'
+    identifying._journal.parent.mkdir()
     reasons, figures = 'no gain on held-out poses; ' * 20, '60 poses, RMS 1 -> 2 mm; ' * 20
     for rule in Rule:
         step = identifying._advice = rules()[rule].steps[0]
@@ -111,7 +111,7 @@ def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path,
 def test_what_made_poses_too_few_is_in_the_answer_though_the_error_is_cut(cell, tmp_path):
     """With clocks 3 s apart it was "measure 30 or more"."""
     identifying, hint = cell.node._identifying, apart(-3.0).text
-    cell.node._archive._path = tmp_path / 'ur10e_20260102T030405000006Z.csv'
+    identifying._journal = tmp_path / 'ur10e_20260102T030405000006Z.csv'
     counts = f'2500 joint states{", dropped" * 30}; {hint}'
     text = str(too_few(TooFewObservationsError(2, 5, '6 equations each'), counts))
     assert hint not in text

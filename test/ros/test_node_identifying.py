@@ -236,6 +236,25 @@ def test_what_is_called_at_last_holds(cell, recording, held, call):
     assert f'{STOPS} poses measured since' in judged.message
 
 
+@pytest.mark.parametrize('largest_error', [1e-6, 0.01])
+def test_the_text_stays_beside_the_journal_of_its_poses(cell, recording, held, largest_error):
+    """After a ~/clear meanwhile it was beside the next journal, as was the report."""
+    release, problems = held
+    cell.set_parameters({'largest_error': largest_error})
+    cell.play(topics(recording))
+    running = cell.start_call('identify')
+    cell.spin_until(lambda: problems)
+    journal = cell.node._archive.journal
+    cell.done('clear')
+    release.set()
+    cell.spin_until(running.done)
+    accepted = running.result().success
+    assert accepted == (largest_error == 0.01)
+    kinds = ('.txt',) if accepted else ('.html', '.txt')
+    notes = sorted(path.name for path in journal.parent.glob('*.identified.*'))
+    assert notes == [journal.with_suffix(f'.identified{kind}').name for kind in kinds]
+
+
 def test_a_calibration_is_saved_where_it_was_to_be_when_it_was_called(
     cell, recording, monkeypatch
 ):
