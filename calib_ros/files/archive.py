@@ -233,4 +233,4 @@ class Archive:
 
     def _files(self, ending: str) -> list[Path]:
         found = (path for _, ends, path in sorted(self._dated()) if ends == ending)
-        return [path for path in found if path.stat().st_size]
+        return [path for path in found if path.is_file() and path.stat().st_size]
