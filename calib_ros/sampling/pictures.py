@@ -37,6 +37,15 @@ class Flaw(NamedTuple):
     reason: str
 
 
+WHILE_OTHERS = Flaw(
+    'while others were processed', f'{MOST_WAITING} others were still processed: stop for longer'
+)
+FORGOTTEN = Flaw(
+    'dropped, memory for images full',
+    'the memory for images was full: send fewer or smaller ones',
+)
+
+
 class BoardFinder(Protocol):
     """A board detector for images."""
 
@@ -86,7 +95,7 @@ class Pictures:
 
         With `wait` all of them are finished.
         """
-        self._queue += ((each, begun) for each in made if (begun := self._begin(each)))
+        self._queue += ((each, self._begin(each)) for each in made)
         found: list[Sample] = []
         while self._queue and (wait or self._queue[0][1].done()):
             sample, begun = self._queue.popleft()
@@ -100,23 +109,19 @@ class Pictures:
                 found.append(result)
         return found
 
-    def _begin(self, sample: Sample) -> Future[Sample | Flaw] | None:
-        """Return the sample once its image is processed; None if it is dropped."""
+    def _begin(self, sample: Sample) -> Future[Sample | Flaw]:
+        """Return the sample once its image is processed, at once if none is."""
         if not sample.images:
-            ready: Future[Sample | Flaw] = Future()
-            ready.set_result(sample)
-            return ready
+            return _ready(sample)
         busy = [begun for _, begun in self._queue if not begun.done()]
         if len(busy) >= MOST_WAITING:
             if not self.patient:
-                self.dropped['measurements: image while others were processed'] += sample.count
-                return None
+                return _ready(WHILE_OTHERS)
             busy[0].exception()
         middle = len(sample.images) // 2
         kept = [k for k, number in enumerate(sample.images) if number in self._kept]
         if not kept:
-            self.dropped['measurements: image dropped, memory for images full'] += sample.count
-            return None
+            return _ready(FORGOTTEN)
         nearest = min(kept, key=lambda k: abs(k - middle))
         return self._pool.submit(self._look, sample, *self._kept[sample.images[nearest]])
 
@@ -147,3 +152,9 @@ class Pictures:
             rotation=found.rotations[0],
             covariance=self._sigma() ** 2 * uncertainty(seen, pose, view.lens)[0],
         )
+
+
+def _ready(result: Sample | Flaw) -> Future[Sample | Flaw]:
+    future: Future[Sample | Flaw] = Future()
+    future.set_result(result)
+    return future

@@ -2,13 +2,51 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images of stops: how many are kept, and that their colours do not matter."""
 
+import threading
+
 import numpy as np
 import pytest
 
 from calib_ros.files.cameras import grey
 from calib_ros.sampling import pictures
+from calib_ros.sampling.sample import Sample
 
 pytest.importorskip('cv2')
+
+
+class Blind:
+    """A detector that never sees a board, once it is let go."""
+
+    def __init__(self):
+        self.release = threading.Event()
+
+    def look(self, message):
+        assert self.release.wait(60)
+        return pictures.Flaw('without board', 'no board in it')
+
+
+def test_why_an_image_is_not_looked_at_is_told():
+    """~/capture told why the image before was not used, or nothing at all."""
+    kept, camera = pictures.Pictures(lambda: 0.3), Blind()
+    kept.cameras = {'image': camera}
+
+    def sample(number):
+        return Sample(number, np.zeros(2), images=(number,))
+
+    assert kept.through([sample(99)], wait=True) == []  # an image that is no more
+    assert 'the memory for images was full' in kept.refused == kept.reason
+    waiting = [sample(kept.keep('image', 1, lambda: None)) for _ in range(5)]
+    assert kept.through(waiting, wait=False) == []
+    camera.release.set()
+    assert kept.through([], wait=True) == []
+    assert kept.refused == '4 others were still processed: stop for longer'
+    assert kept.through([sample(kept.keep('image', 1, lambda: None))], wait=True) == []
+    assert kept.refused == 'no board in it'
+    assert kept.dropped == {
+        'measurements: image dropped, memory for images full': 1,
+        'measurements: image while others were processed': 1,
+        'measurements: image without board': 5,
+    }
 
 
 def test_memory_for_images_is_bounded(monkeypatch):
