@@ -111,9 +111,9 @@ class Guide:
             if before is not None:
                 before.result()
 
-    def show(self, calibration: Calibration) -> None:
-        """Publish the errors over the workspace of a calibration."""
-        self._start(self._guarded(self._show), calibration)
+    def show(self, calibration: Calibration, world: str) -> None:
+        """Publish the errors over the workspace of a calibration with its base in a frame."""
+        self._start(self._guarded(self._show), calibration, world)
 
     def _start(self, work: Callable[..., None], *arguments: Any) -> Future[None]:
         with self._lock:  # identifications call from their own thread
@@ -146,12 +146,12 @@ class Guide:
             best = candidates[choose(design, candidates, 1)[0]]
             self._next_pose.publish(to_ros.joints(self._session.joint_names, best, self._now()))
 
-    def _show(self, calibration: Calibration) -> None:
+    def _show(self, calibration: Calibration, world: str) -> None:
         points = survey(calibration, CLOUD, np.random.default_rng(0)).cloud
         base = calibration.chain.frame('base').matrix
         points[:, :3] = points[:, :3] @ base[:3, :3].T + base[:3, 3]
         fields = ('x', 'y', 'z', 'error', 'sigma')
-        self._errors.publish(to_ros.cloud(fields, points, calibration.world_frame, self._now()))
+        self._errors.publish(to_ros.cloud(fields, points, world, self._now()))
 
     def _on_trajectory(self, data: bytes) -> None:
         if sum(not each.done() for each in self._pending) > MOST_QUEUED:

@@ -25,8 +25,8 @@ class Broadcast:
     leads to the fixed target, and the tool to the camera.
     """
 
-    def __init__(self, node: Node, given: Given, in_hand: bool, urdf: str) -> None:
-        self._node, self._given, self._in_hand = node, given, in_hand
+    def __init__(self, node: Node, given: Given, urdf: str) -> None:
+        self._node, self._given = node, given
         self._publisher = None
         if not given.base_frame and not given.flange_frame:
             return
@@ -43,13 +43,13 @@ class Broadcast:
             self._base = described.frame('base').matrix
             self._tool = described.frame('tool').matrix
 
-    def publish(self, chain: Chain, world: str) -> None:
+    def publish(self, chain: Chain, world: str, in_hand: bool) -> None:
         """Publish the frames of a calibrated chain measured in the frame `world`."""
         if self._publisher is None:
             return
         given, transforms = self._given, []
         target = given.target_frame
-        stands, moves = (target, world) if self._in_hand else (world, target)
+        stands, moves = (target, world) if in_hand else (world, target)
         if not world:
             self._node.get_logger().warning('the measurements name no frame: /tf_static lacks it')
         if given.base_frame and stands:

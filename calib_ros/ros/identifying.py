@@ -181,7 +181,9 @@ class Identifying:
         self.observability = words.observability_in_words(result)
         scale = self._node.get_parameter('marker_scale').value
         now = self._node.get_clock().now().to_msg()
-        markers = to_ros.residual_markers(result, loaded.problem.sets, scale, now)
+        seen = to_ros.in_hand(loaded.owners)
+        world = self._node.get_parameter('target_frame').value if seen else result.world_frame
+        markers = to_ros.residual_markers(result, loaded.problem.sets, scale, world, now)
         self._residuals.publish(markers)
         page = partial(_page, given, result)
         if result.accepted:

@@ -28,7 +28,6 @@ from calib_ros.ros.parameters import Given
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.sources import parse_sources
 
 FILENAMES = ('target_filename', 'calibration_filename')  # parameters that name files
 
@@ -50,7 +49,7 @@ class Published(NamedTuple):
 class Keeper:
     """Keeps the calibration of a session, its publishers and its files together.
 
-    `adopted` is called with every calibration that comes into use.
+    `adopted` is called with every calibration that comes into use, and the frame of its base.
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class Keeper:
         archive: Archive,
         given: Given,
         urdf: str,
-        adopted: Callable[[Calibration], None],
+        adopted: Callable[[Calibration, str], None],
     ) -> None:
         self._node, self._session, self._archive = node, session, archive
         self._given, self._urdf, self._adopted = given, urdf, adopted
@@ -72,9 +71,7 @@ class Keeper:
         self._calibration = node.create_publisher(String, '~/calibration', LATCHED)
         for name in FILENAMES:
             self._named(name)  # refuse bad names at the start
-        sources = parse_sources(given.settings.sources)
-        in_hand = bool(sources) and all(source.eye_in_hand for source in sources)
-        self._broadcast = Broadcast(node, given, in_hand, urdf)
+        self._broadcast = Broadcast(node, given, urdf)
         self._corrected_pose = node.create_publisher(PoseStamped, '~/corrected_pose', 10)
 
     def adopt(
@@ -89,8 +86,9 @@ class Keeper:
             self._published, self.unsaved = published, samples is not None
             self._dh_parameters.publish(to_ros.dh_parameters(calibration.chain))
             self._calibration.publish(String(data=published.text))
-            self._broadcast.publish(calibration.chain, calibration.world_frame)
-        self._adopted(calibration)
+            seen = to_ros.in_hand(calibration.owners)
+            self._broadcast.publish(calibration.chain, calibration.world_frame, seen)
+        self._adopted(calibration, self._world(calibration))
 
     def to_save(self) -> tuple[Published, Path | None]:
         """Return the calibration to save, and `target_filename` as it is now."""
@@ -172,8 +170,13 @@ class Keeper:
             return
         self._posed = latest
         stamp_ns, values = latest
-        pose = to_ros.pose(calibration.chain, values, stamp_ns, calibration.world_frame)
+        pose = to_ros.pose(calibration.chain, values, stamp_ns, self._world(calibration))
         self._corrected_pose.publish(pose)
+
+    def _world(self, calibration: Calibration) -> str:
+        """Return the frame of the measurements, or the target of a camera on the flange."""
+        seen = to_ros.in_hand(calibration.owners)
+        return str(self._given.target_frame if seen else calibration.world_frame)
 
     def _named(self, parameter: str) -> Path | None:
         return self.file_of(parameter, self._node.get_parameter(parameter).value)

@@ -9,7 +9,7 @@ as garbage: everything is converted to plain Python values here.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from calib_ros.decision.comparison import residuals
 from calib_ros.decision.result import Identification
 from calib_ros.errors import MOST_ENTRIES
 from calib_ros.estimation.observations import Observations
+from calib_ros.identification.records import Owner
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray, invert, to_quat
 
@@ -31,6 +32,11 @@ LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 """For topics whose last message late subscribers receive."""
+
+
+def in_hand(owners: Mapping[str, Owner]) -> bool:
+    """Tell whether the device is a camera on the flange, so that its target is the world."""
+    return 'base' in owners and owners['base'][1]
 
 
 def dh_parameters(chain: Chain) -> Float64MultiArray:
@@ -87,7 +93,7 @@ def cloud(fields: Sequence[str], rows: FloatArray, frame_id: str, stamp: Any) ->
 
 
 def residual_markers(
-    result: Identification, sets: Sequence[Observations], scale: float, stamp: Any
+    result: Identification, sets: Sequence[Observations], scale: float, frame_id: str, stamp: Any
 ) -> MarkerArray:
     """Return the residual at each measured position, enlarged `scale` times.
 
@@ -96,7 +102,7 @@ def residual_markers(
     """
     lines = Marker(ns='residuals', id=0, type=Marker.LINE_LIST, action=Marker.ADD)
     lines.header.stamp = stamp
-    lines.header.frame_id = result.world_frame
+    lines.header.frame_id = frame_id
     lines.pose.orientation.w = 1.0
     lines.scale.x = 0.002
     base = result.chain.frame('base').matrix

@@ -69,7 +69,7 @@ def broadcast(chain, world='leica', in_hand=False, urdf='', **names):
     given = SimpleNamespace(links={}, **(NAMES | names))
     with Cell() as cell:
         heard = cell.listen(TFMessage, '/tf_static')
-        Broadcast(cell.peer, given, in_hand, urdf).publish(chain, world)
+        Broadcast(cell.peer, given, urdf).publish(chain, world, in_hand)
         cell.spin_until(lambda: heard)
     return transforms(heard[0])
 

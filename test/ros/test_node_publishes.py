@@ -9,6 +9,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from ros_cell import STOPS, Cell, joint_messages, pose_messages, topics, values_of
+from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -108,3 +109,28 @@ def test_residuals_of_all_devices_are_drawn_in_one_frame(tmp_path, recording, tr
         shown = [(color.r, color.g) for color in lines.colors[: 2 * STOPS : 2]]
         np.testing.assert_allclose(shown, np.column_stack([red, 1.0 - red]), atol=1e-6)
         np.testing.assert_allclose(begins[1], begins[0], atol=5e-4)
+
+
+def test_what_a_camera_on_the_flange_measured_is_drawn_where_its_target_is(tmp_path, recording):
+    """Residuals, errors and poses in the frame of the target were said to be in the camera's."""
+    poses = recording.poses
+    turns = np.swapaxes(poses.rotations, 1, 2)
+    places = -(turns @ poses.positions[..., np.newaxis])[..., 0]
+    seen = pose_messages(replace(poses, positions=places, rotations=turns), frame_id='camera')
+    given = {'sources': ['measured_pose eye_in_hand=true'], 'target_frame': 'board'}
+    with Cell(chain='ur10e', data_dir=str(tmp_path), **given) as cell:
+        topic = 'calibration_node/corrected_pose'
+        poses_heard = cell.listen(PoseStamped, topic, 10)
+        cell.play(topics(recording, measured_pose=seen))
+        cell.done('identify')
+        lines = cell.listen(MarkerArray, 'calibration_node/residuals')
+        clouds = cell.listen(PointCloud2, 'calibration_node/workspace_error')
+        cell.play({'joint_states': joint_messages(recording)[-1:]})
+        cell.spin_until(lambda: lines and clouds and poses_heard)
+        marker = lines[0].markers[0]
+        for message in (marker, clouds[0], poses_heard[-1]):
+            assert message.header.frame_id == 'board'
+        at = marker.points[-2]
+        place = poses_heard[-1].pose.position
+        far = [at.x - place.x, at.y - place.y, at.z - place.z]
+        np.testing.assert_allclose(far, 0.0, atol=5e-4)  # of the camera, at the last stop
