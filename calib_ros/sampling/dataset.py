@@ -179,6 +179,8 @@ def dataset_of(
     sets: tuple[list[Observations], list[Observations]] = ([], [])  # fitted, held out
     for members, found in collect(samples, sigmas, frames, posed, observed):
         sets[samples[members[0]].validation].append(found)
-    pairs, world_frame = tuple(socket_pairs(samples, frames)), samples[0].frame_id  # of `base`
+    pairs = tuple(socket_pairs(samples, frames))
+    free = (each.frame_id for each in samples if not (each.socket or each.plane))
+    world_frame = next(free, '')  # of `base`
     cameras = {} if posed else lenses_by_frame(samples, frames)
     return Dataset(*sets, pairs, world_frame, cameras, frames.owners)

@@ -44,6 +44,17 @@ def test_no_socket_and_no_plane_is_the_first():
     assert frames.of(labelled('s', 'tracker', '', False)) == ('base', 'tool')
 
 
+@pytest.mark.parametrize('kind', ['socket', 'plane'])
+def test_the_world_is_the_frame_of_the_device_that_has_the_base(kind):
+    """After a ball in a socket it had no name: nothing was on /tf_static."""
+    hole = Sample(2, np.zeros(2), device='A_1', distance=None if kind == 'socket' else 0.0)
+    tracker = replace(PLAIN, frame_id='tracker')
+    other = replace(PLAIN, device='other', frame_id='elsewhere')
+    samples = [replace(hole, **{kind: True}), tracker, other]
+    assert dataset_of(samples, SIGMAS).world_frame == 'tracker'
+    assert dataset_of(samples[:1], SIGMAS).world_frame == ''
+
+
 @given(labels)
 def test_frames_are_shared_by_those_that_share_them_and_by_no_others(many):
     """Whatever the names: a session may be called like a device."""
