@@ -236,8 +236,7 @@ class MessageFilter:
         """Count received messages that cannot be used."""
         self.received[kind] += count
         self.dropped[f'{kind}: {cause}'] += count
-        if cause != OTHERS:
-            self.refused[kind] = cause
+        self.refused[kind] = cause
 
     def _usable(self, part: Part) -> Part:
         good, causes = usable(part, joints=part.source is None)
@@ -251,6 +250,10 @@ class MessageFilter:
             places, _, (_, *names), stamps, numbers = part
             self._names.hear(names, numbers)
             columns, index, fault = self._names.layout(names)
+            if fault == OTHERS:  # such as a gripper's, which publishes apart
+                self.received[JOINTS] += len(stamps)
+                self.unused[f'{JOINTS}: {OTHERS}'] += len(stamps)
+                continue
             if fault:
                 self.miss(JOINTS, len(stamps), fault)
                 continue

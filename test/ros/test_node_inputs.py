@@ -117,6 +117,24 @@ def test_a_short_queue_that_loses_nothing_is_no_loss(tmp_path, recording):
         play(2, True)
 
 
+def test_a_gripper_that_publishes_apart_is_no_loss(cell, recording):
+    """Each message was dropped, and the diagnostics were WARN for ever."""
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    arm = joint_messages(recording)[:50]
+    finger = [
+        JointState(header=each.header, name=['finger'], position=[0.01 * k])
+        for k, each in enumerate(arm)
+    ]
+    cell.play({'joint_states': [each for both in zip(arm, finger, strict=True) for each in both]})
+    del heard[:]
+    cell.spin_until(lambda: heard)
+    values = values_of(heard[-1])
+    assert values['not used joints: none of the joints in the message'] == '50'
+    assert values['note joint that moves but is not in the chain: finger'] == '1'
+    assert not any(key.startswith('dropped') for key in values)
+    assert not any('messages are dropped' in report.status[0].message for report in heard)
+
+
 def test_messages_of_seconds_wait_while_the_node_is_busy(tmp_path, recording):
     """Joint values in degrees let the node judge poses for five seconds: a fifth was lost."""
     override = {'qos_overrides./joint_states.subscription.reliability': 'reliable'}
