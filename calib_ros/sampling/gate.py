@@ -33,7 +33,7 @@ class Gate:
         return sum(each[0] == kind for each in self._held)
 
     def through(self, given: Slice) -> Iterator[tuple[Slice, bool]]:
-        """Yield what may pass now, and whether the joints' clock was moved before it.
+        """Yield what may pass now, and whether the joints' clock was moved back before it.
 
         Held messages pass with a later message, in order of arrival.
         """
@@ -45,8 +45,8 @@ class Gate:
                 yield left.between(0, count), False
             else:
                 count = 1
-                found, moved = self._admitted(left.between(0, 1))
-                yield from ((each, moved) for each in found)
+                found, back = self._admitted(left.between(0, 1))
+                yield from ((each, back and each is found[0]) for each in found)
             begin += count
 
     def release(self) -> list[Slice]:
@@ -76,7 +76,7 @@ class Gate:
         return count
 
     def _admitted(self, given: Slice) -> tuple[list[Slice], bool]:
-        """Take one message; return what passes, and whether the joints' clock was moved."""
+        """Take one message; return what passes, and whether the joints' clock was moved back."""
         kind, time_ns = JOINTS if given.joints[0] else POSES, int(given.times[0])
         if self._is_near(time_ns):
             self._last[kind] = time_ns
@@ -96,8 +96,9 @@ class Gate:
 
         freed = [each for each in self._held if passes(each)]
         self._held = [each for each in self._held if not passes(each)]
+        before = self._last.get(JOINTS, 0)
         self._last.update((other, time) for other, time, _ in freed)
-        return [item for *_, item in freed], any(other == JOINTS for other, *_ in freed)
+        return [item for *_, item in freed], self._last.get(JOINTS, 0) < before
 
     def _is_near(self, time_ns: int) -> bool:
         lasts = self._last.values()

@@ -76,8 +76,8 @@ class Pipeline:
 
     def _pass(self, come: Iterable[tuple[Slice, bool]]) -> None:
         error: Exception | None = None
-        for left, moved in come:
-            if moved and left.times[0] < self.collector.track.horizon_ns:
+        for left, back in come:
+            if back:
                 self.collector.start_anew()
             while len(left):
                 count, rounds = self.collector.reach(left, self.clocks.due)

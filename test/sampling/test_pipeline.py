@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from arriving import assert_same
 from hypothesis import given, strategies as st
-from streams import S, hear, stamps, stops
+from streams import S, hear, stamps, stops, sweep
 
 from calib_ros import CalibrationSession, load_chain
 from calib_ros.sampling.gate import STRAY, Gate
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice, StreamKey
+from calib_ros.settings import Settings
 
 ARM = load_chain('ur5e')
 POSE_KEY = StreamKey('', '', False, False, False)
@@ -194,3 +195,21 @@ def test_a_recording_played_again_counts_one_jump_however_it_comes(seed):
         )
         played(session, off, came, seen)
         assert session.account().notes.get('the clock jumped back', 0) == again
+
+
+@pytest.mark.parametrize(('mode', 'jump'), [('continuous', 2.5), ('dwell', 6.5), ('dwell', 6.95)])
+def test_joints_of_before_a_jump_back_do_not_mix_with_those_after_it(mode, jump):
+    """While the delay was estimated, or if the jump was short, both were on one track."""
+    motion = sweep(6, np.random.default_rng(3)) if mode == 'continuous' else MOTION
+    session, off, end = CalibrationSession(ARM, Settings(mode=mode)), -1.6, 24.0
+    times, seen = np.arange(0.0, end, 0.02), np.arange(0.003, end, 0.05)
+    clocks = [t + np.where(t < jump, 0.0, off) for t in (times, seen)]
+    poses = ARM.forward(motion(seen))
+    joints = times, stamps(clocks[0]), motion(times)
+    hear(session, joints, (seen, stamps(clocks[1]), poses[:, :3, 3], poses[:, :3, :3]))
+    session.finish()
+    assert session.account().notes['the clock jumped back'] == 1
+    assert not any('different values' in cause for cause in session.account().dropped)
+    away = [ARM.forward(s.joints[np.newaxis])[0, :3, 3] - s.position for s in session.samples]
+    assert len(away) > (10 if mode == 'dwell' else 300)
+    assert np.abs(away).max() < 1e-3
