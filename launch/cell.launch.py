@@ -37,6 +37,7 @@ from calib_ros.ros.arguments import (
     rviz_config,
     switched,
 )
+from calib_ros.values import parse_like
 
 CONFIG = Path(__file__).parents[1] / 'config'
 OURS = {
@@ -57,12 +58,12 @@ ARGUMENTS = {name: ('', text) for name, text in launch_arguments().items()} | OU
 def calibration(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
     """Return the node, and what starts it again with its samples when it was killed."""
     node = Node(**node_options(given))
+    delay = parse_like(0.0, given['respawn_delay'], 'launch argument "respawn_delay"')
 
     def on_exit(event: Any, context: LaunchContext) -> list[LaunchDescriptionEntity]:
         if event.returncode >= 0 or context.is_shutdown:  # it has said why, or was told to end
             return []
         again = calibration(given | {'resume': 'true'})
-        delay = float(given['respawn_delay'])
         return [
             LogInfo(msg=f'{NODE} was killed (signal {-event.returncode}): restarting'),
             TimerAction(period=delay, actions=again),

@@ -89,6 +89,13 @@ def test_a_node_that_was_killed_goes_on_with_its_samples(launched):
     assert exited['on_exit'](SimpleNamespace(returncode=-9), context) == []
 
 
+def test_a_delay_that_is_none_is_refused_at_the_start(launched):
+    """The launch failed when the node was killed, rather than start it again."""
+    said = 'launch argument "respawn_delay" must be a finite number, not \'2 s\''
+    with pytest.raises(ConfigError, match=said):
+        launched('cell.launch.py', chain='ur10e', respawn_delay='2 s', **QUIET)
+
+
 def test_the_example_feeds_the_corrected_urdf_to_all(launched, tmp_path, monkeypatch):
     urdf = tmp_path / 'robot_corrected.urdf'
     urdf.write_text('<robot name="corrected"/>')
