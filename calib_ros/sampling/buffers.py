@@ -65,14 +65,17 @@ class Rows:
     def sort(self) -> tuple[int, int]:
         """Sort the rows by stamp, one row each; return how many were dropped as equal or contrary.
 
-        Of equal stamps the smallest values are kept, so that the order of arrival does not matter.
+        Of equal stamps the row with most values is kept, or the smallest values, so that the order
+        of arrival does not matter.
         """
         if (np.diff(self.stamps) > 0).all():
             return 0, 0
-        order = np.lexsort((*self.values.T[::-1], self.stamps))
+        missing = np.isnan(self.values)  # rotations and covariances that others have
+        order = np.lexsort((*self.values.T[::-1], missing.sum(axis=1), self.stamps))
         again = np.diff(self.stamps[order]) == 0
         after, before = self.values[order[1:][again]], self.values[order[:-1][again]]
-        near = np.isclose(after, before, AS_FLOATS, AS_FLOATS, equal_nan=True).all(axis=1)
+        near = np.isclose(after, before, AS_FLOATS, AS_FLOATS)
+        near = (near | np.isnan(after) | np.isnan(before)).all(axis=1)
         self.keep(order[np.concatenate([[True], ~again])])
         return int(near.sum()), int((~near).sum())
 

@@ -3,8 +3,9 @@
 """Every measurement that came is in a sample, waits, or is counted with a cause: none is lost."""
 
 import numpy as np
+import pytest
 from hypothesis import Phase, given, settings, strategies as st
-from recorded import distance
+from recorded import distance, point_stamped, pose_with_covariance
 from streams import (
     MS,
     POSE,
@@ -26,6 +27,8 @@ from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import Source
 from calib_ros.settings import MODES, Settings
 
+POINT = 'geometry_msgs/msg/PointStamped'
+WITH_COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 ARM = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4), Joint('c')))
 SOURCES = (
     (Source('pose'), POSE, lambda stamp, where: pose(stamp, where)),
@@ -163,3 +166,27 @@ def test_every_measurement_is_accounted_for(plan, traffic):
 def test_the_name_of_a_frame_makes_no_loss():
     cause = 'measurements: in frame "stamping press", not in frame_id "memory"'
     assert lost('measurements', 100, {cause: 50}) == (0.0, '')
+
+
+@pytest.mark.parametrize('full', [0, 1])
+def test_a_driver_that_publishes_each_pose_twice_loses_nothing(full):
+    """As a position and a pose, or without and with covariance: half was lost, it was told."""
+    session, motion = CalibrationSession(ARM), stops(np.full((3, 3), 0.1) * [[1], [2], [3]])
+    covariance = np.diag([1e-8] * 3 + [1e-6] * 3)
+    for time_s in np.arange(0.0, 5.5, 0.02):
+        stamp_ns, joints = START + round(time_s * 1e9), motion([time_s])[0]
+        at = joints + 1.0, (0.0, 0.0, 0.0, 1.0)
+        poor = POINT, point_stamped(stamp_ns, at[0] - 1e-12)
+        rich = POSE, pose(stamp_ns, at[0])
+        if full:
+            poor, rich = rich, (WITH_COVARIANCE, pose_with_covariance(stamp_ns, covariance, at))
+        come = [(Source(kind), kind, message) for kind, message in (poor, rich)]
+        take(session, of_joints(joint_state(stamp_ns, ARM.joint_names, joints)), *come)
+    session.finish()
+    account = session.account()
+    assert set(account.dropped) == {'measurements: same stamp twice'}
+    assert account.dropped['measurements: same stamp twice'] == account.poses // 2
+    assert len(session.samples) == 3
+    for sample in session.samples:
+        assert sample.rotation is not None
+        assert (sample.covariance is not None) == full
