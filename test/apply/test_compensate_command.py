@@ -183,6 +183,16 @@ def test_a_program_is_written_as_it_was_read(tmp_path, suffix):
     assert read_program(again, UR).text_with(source.program) == text
 
 
+def test_columns_without_names_move_no_joint_value(tmp_path):
+    """Two empty columns had counted as one: each joint got the value of the next."""
+    path, arm = tmp_path / 'program.csv', Chain('arm', 'standard', (Joint('a'), Joint('b')))
+    given = 'label,,note,,q1,, q2,\nP1,x,,y,0.25,,-1.5,\n'
+    path.write_text(given)
+    source = read_program(path, arm)
+    np.testing.assert_array_equal(source.program.positions, [[0.25, -1.5]])
+    assert source.text_with(source.program) == given
+
+
 @pytest.mark.parametrize('coding', ['utf-8-sig', 'utf-16', 'cp1252'])
 def test_a_program_keeps_its_separators_and_decimal_commas(tmp_path, coding):
     """As tables of measurements; they were refused, and had to be saved in another form."""
