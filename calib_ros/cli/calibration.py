@@ -76,7 +76,7 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
 def _export(options: argparse.Namespace, screen: Screen) -> int:
     from calib_ros.files.export import CORRECTED_URDF, FILES, exports, urdf_export
     from calib_ros.files.programs import read_joints
-    from calib_ros.files.vendors import VENDOR_FILES, vendor_files
+    from calib_ros.files.vendors import UR, VENDOR_FILES, vendor_files
 
     nominal = load_chain(options.chain)
     calibration = calibration_of(options.calibration, 'export', nominal)
@@ -92,6 +92,8 @@ def _export(options: argparse.Namespace, screen: Screen) -> int:
     elif Path(options.chain).suffix in URDF_SUFFIXES:
         urdf = chain_text(Path(options.chain))
     found += vendor_files(chain, nominal, origin, urdf, links, options.ur_hash)
+    if options.ur_hash and all(each.name != UR.file for each in found):
+        raise InputError(f'--ur-hash does not apply to {chain.name}: it gets no {UR.file}')
     with common.output_files(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as contents:
         contents |= {each.name: each.content for each in found}
     for each in found:

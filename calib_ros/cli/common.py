@@ -59,6 +59,7 @@ NEEDS = {
     '--detections': ('board', 'places', 'intrinsics', 'lens'),
     '--joints': ('joints_preset',),
     '--tracker': ('axis', 'cone'),
+    '--urdf': ('base_link', 'tip_link'),
     '--out': ('pdf',),
 }
 """Options that do nothing without another one."""
@@ -89,7 +90,8 @@ def refuse_alone(options: argparse.Namespace) -> None:
 def refuse_ignored(options: argparse.Namespace, source: str) -> None:
     """Refuse options that a bag, or a table, would ignore."""
     if source == 'table':
-        refuse(options, (*SETTINGS['bags: what is read'], 'frame_id'), 'does not apply to a table')
+        of_bags = (n for title in SETTINGS if title.startswith('bags') for n in SETTINGS[title])
+        refuse(options, (*of_bags, 'frame_id', 'largest_loss'), 'does not apply to a table')
     else:
         instead = 'does not apply to a bag: add eye_in_hand=true to its --sources'
         refuse(options, ('eye_in_hand',), instead)

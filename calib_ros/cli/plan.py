@@ -29,7 +29,7 @@ from calib_ros.report.applied import plan_report
 TESTS = 'P1 to P5 of ISO 9283 in a cube of {:.3f} m, in {}; collisions are not checked'
 VISIT = 'visit P1 to P5 in turn, 30 times, and measure each time'
 WITH_TURNS = 'orientations are measured too (of a reflector alone: --measured position)'
-NOT_OF_TESTS = ('poses', 'accuracy', 'candidates', 'task', 'taken')
+NOT_OF_TESTS = ('poses', 'accuracy', 'candidates', 'task', 'taken', 'draw', 'criterion', 'apart')
 ORIENTED = 'various orientations', 'one orientation'
 
 
@@ -119,7 +119,11 @@ def _measurement(
 
 def _check(options: argparse.Namespace) -> None:
     if options.iso9283:
-        common.refuse(options, NOT_OF_TESTS, 'does not apply to --iso9283')
+        common.refuse(options, (*NOT_OF_TESTS, 'velocity'), 'does not apply to --iso9283')
+    if options.candidates is not None:
+        common.refuse(options, ('draw',), 'does not apply to --candidates')
+    if options.box is None and options.tracker is None:
+        common.refuse(options, ('world',), 'needs --box or --tracker')
     common.at_least(options, poses=1, draw=1, seed=0, apart=0)
     if options.accuracy is not None and not options.accuracy > 0.0:
         raise InputError(f'--accuracy must be positive, not {options.accuracy}')

@@ -53,7 +53,17 @@ def bad_inputs():
     for useless in (('--history', 'h'), ('--model', 'auto')):
         given = (*good, *useless, '--previous', 'r')
         yield f'useless {useless[0]}', given, f'{useless[0]} does not apply to --previous'
-    yield 'useless delay', (*good, '--delay', '0.1'), '--delay does not apply to a table'
+    for useless in (('--delay', '0.1'), ('--mode', 'continuous'), ('--largest-loss', '1')):
+        yield f'useless {useless[0]}', (*good, *useless), f'{useless[0]} does not apply to a table'
+    plan = ('plan', '--chain', 'ur5e')
+    for useless in (('--draw', '9'), ('--criterion', 'o2'), ('--velocity', '2')):
+        told = f'{useless[0]} does not apply to --iso9283'
+        yield f'tests and {useless[0]}', (*plan, '--iso9283', *useless), told
+    given = (*plan, '--candidates', 'none.csv', '--draw', '9')
+    yield 'nothing drawn', given, '--draw does not apply to --candidates'
+    yield 'nothing in the world', (*plan, '--world'), '--world needs --box or --tracker'
+    given = ('export', 'none', '--chain', 'ur5e', '--out', 'e', '--tip-link', 'tool0')
+    yield 'a link of nothing', given, '--tip-link needs --urdf'
     yield 'useless session', (*bag_of, 'folder', '--session', 'A'), 'does not apply to a bag\n'
     yield 'useless side', (*bag_of, 'folder', '--eye-in-hand'), ': add eye_in_hand=true to its --'
     names = ('--joint-names', 'a,a,b,c,d,e,f')

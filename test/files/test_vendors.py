@@ -182,3 +182,11 @@ def test_the_command_line_writes_it(run, tmp_path, chain):
     document = yaml.safe_load((tmp_path / 'out/ur_kinematics.yaml').read_text())
     assert document['kinematics']['hash'] == 'calib_42'
     assert document['calibration'] == {'samples': 60}
+
+
+def test_the_command_line_refuses_a_checksum_for_another_arm(run, tmp_path):
+    (tmp_path / 'calibration.yaml').write_text(dump_chain(load_chain('puma560'), {'source': 'x'}))
+    given = ('calibration.yaml', '--chain', 'puma560', '--out', 'out', '--ur-hash', 'calib_42')
+    status, _, err = run('export', *given)
+    assert (status, '--ur-hash does not apply to puma560' in err) == (1, True)
+    assert not (tmp_path / 'out').exists()
