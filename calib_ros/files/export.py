@@ -131,19 +131,29 @@ def converted(chain: Chain, convention: Convention) -> Chain:
     if chain.convention == convention:
         return chain
     tails = [{name: getattr(joint, name) for name in TAIL} for joint in chain.joints]
+    bends, gravity = [_tail(**tail) for tail in tails], chain.gravity
     none, base, tool = dict.fromkeys(TAIL, 0.0), chain.frame('base'), chain.frame('tool')
     moved = dict(zip(chain.joint_names, chain.joint_names[1:], strict=False))
     if convention == 'modified':
-        tool = replace(tool, matrix=_tail(**tails[-1]) @ tool.matrix)
+        tool = replace(tool, matrix=bends[-1] @ tool.matrix)
         tails = [none, *tails[:-1]]
     else:
         moved = {after: before for before, after in moved.items()}
-        base = replace(base, matrix=base.matrix @ _tail(**tails[0]))
-        tails = [*tails[1:], none]
-    joints = tuple(replace(j, **tail) for j, tail in zip(chain.joints, tails, strict=True))
+        base = replace(base, matrix=base.matrix @ bends[0])
+        gx, gy, gz = (bends[0][:3, :3].T @ gravity).tolist()
+        gravity, tails = (gx, gy, gz), [*tails[1:], none]
+        bends = [*map(se3.invert, bends[1:]), np.eye(4)]
+    rows = zip(chain.joints, tails, bends, strict=True)
+    joints = tuple(replace(_weighed(joint, bend), **tail) for joint, tail, bend in rows)
     parallel = tuple(moved[name] for name in chain.parallel or () if name in moved)
     more: dict[str, Any] = {'base': base, 'tool': tool, 'frames': (), 'parallel': parallel}
-    return replace(chain, convention=convention, joints=joints, **more)
+    return replace(chain, convention=convention, joints=joints, gravity=gravity, **more)
+
+
+def _weighed(joint: Joint, bend: FloatArray) -> Joint:
+    """Return a joint whose mass is given in another frame at the end of its link."""
+    x, y, z, _ = (bend @ [*joint.com, 1.0]).tolist()
+    return replace(joint, com=(x, y, z)) if joint.mass else joint
 
 
 def cut_off(chain: Chain, convention: Convention) -> str:

@@ -88,6 +88,21 @@ def test_the_other_convention_has_the_same_parameters(convention):
 
 
 @pytest.mark.parametrize('convention', ['standard', 'modified'])
+def test_the_other_convention_bends_alike(convention):
+    """Centres of mass are given in the links' frames, gravity in that before the first row."""
+    nominal = converted(load_chain('puma560'), convention)
+    rows = (Joint('foot', alpha=np.pi / 3.0, d=-0.3), *nominal.joints)
+    loaded = (replace(row, mass=2.0, com=(0.1, 0.2, 0.3)) for row in rows)
+    chain = Chain('loaded', convention, tuple(loaded), gravity=(1.0, 2.0, -9.0))
+    files = {each.name: each.content for each in exports(chain, chain)}
+    bent = []
+    for each in (chain, *(parse_chain(files[f'dh_{name}.yaml']) for name in get_args(Convention))):
+        q = chain.random_joints(20, np.random.default_rng(1))
+        bent.append(each.with_effect_values({'joint_2.compliance': 1e-3}).forward(q))
+    np.testing.assert_allclose(bent[1:], [bent[0]] * 2, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize('convention', ['standard', 'modified'])
 def test_axes_six_degrees_from_parallel_need_no_beta(convention):
     rows = load_chain('puma560').with_offsets({'joint_2.beta': 0.1})
     nominal = replace(converted(rows, convention), base=None, tool=None)
