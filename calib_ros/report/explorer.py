@@ -49,6 +49,8 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
         'turned_after': _values(shown, 'angle', 'after'),
         'size': shown.size,
     }
+    if chain.effects or chain.held:  # a palletiser's hand is level
+        arrays['effective'] = chain.effective(shown.joints.T).T
     return {
         'joints': [one_line(name) for name in chain.joint_names],
         'show': [list(unit_of(joint)) for joint in chain.joints],

@@ -14,6 +14,7 @@ from browser import browser, browser_path
 from measured import measured, rows_of, write_csv
 from pages import report_of
 
+from calib_ros.apply.simulation import measure
 from calib_ros.cli.main import main
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.problem import Problem
@@ -198,6 +199,26 @@ def test_a_row_picks_the_pose_and_a_point_its_row(wide, result):
     assert page.inner_text('#rows tr.picked button') == '4'
     assert 'line 5' in page.inner_text('#picked')
     assert 'an outlier' in page.inner_text('#picked')
+
+
+def test_the_hand_of_a_palletiser_is_drawn_level(chromium, tmp_path):
+    """It was drawn at the values reported of coupled joints, a third of a metre off."""
+    arm = load_chain('kuka_youbot')
+    hand = replace(arm.joints[3], lower=0.0, upper=0.0)
+    coupled = (('arm_joint_4.coupling_arm_joint_2', -1.0),)
+    arm = replace(arm, joints=(*arm.joints[:3], hand, *arm.joints[4:]), effects=coupled)
+    rows = measure(arm, arm.random_joints(40, np.random.default_rng(1)), np.random.default_rng(2))
+    problem = Problem(arm, rows)
+    path = tmp_path / 'report.html'
+    path.write_text(render(report_of(problem, identify(problem))))
+    seen = Seen(chromium, path, 1280)
+    tips = '[...Array(40).keys()].map((i) => c.frames(i).at(-1).slice(0, 3).map((row) => row[3]))'
+    drawn, there = seen.page.evaluate(
+        f'(() => {{ const c = window.calibRos; return [{tips},'
+        ' [...Array(40).keys()].map((i) => c.position(i))]; })()'
+    )
+    np.testing.assert_allclose(drawn, there, rtol=0, atol=1e-6)
+    seen.end()
 
 
 @pytest.mark.parametrize('way', ['left', 'right', 'up', 'down'])

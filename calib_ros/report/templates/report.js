@@ -101,12 +101,13 @@
     m[k][3] = d;
     return m;
   };
+  const joints = floats.effective || floats.joints;
   function frames(i) {
     let T = moved(0, 0);
     const found = [T];
     e.table.forEach((row, k) => {
       let [a, alpha, d, theta, beta, b, sign, slides] = row;
-      const q = sign * floats.joints[n * i + k];
+      const q = sign * joints[n * i + k];
       if (slides) d += q; else theta += q;
       const drive = product(turned(2, theta), moved(2, d));
       const link = [moved(1, b), turned(0, alpha), turned(1, beta)].reduce(product, moved(0, a));
