@@ -341,13 +341,13 @@ def _parameters(result: Identification) -> Section:
     listed = [p for p in result.parameters if group_of(p.name) != 'gear']
     unlisted = len(result.parameters) - len(listed)
     for p in listed:
-        unit = p.name.unit
-        scale, small = (1.0, unit) if p.name.of_lens else (1e3, f'm{unit}')
+        scale, small = words.small_unit(p.name)
+        unit = p.name.unit.removeprefix('1')  # a pure number has none
         placed = p.std is None or result.chain.owns_frame(p.name)
         found = (None if placed else p.offset, p.std, p.half_width())
         forms = zip(found, ('+.4f', '.4f', '.4f'), strict=True)
         numbers = ['' if x is None else f'{scale * x:{form}}' for x, form in forms]
-        rows.append((p.name, f'{p.value:.9f} {unit}', *numbers, small, p.status))
+        rows.append((p.name, f'{p.value:.9f} {unit}'.rstrip(), *numbers, small, p.status))
     more = f'; the {unlisted} harmonics of gears are in result.json' if unlisted else ''
     return section(
         'parameters',

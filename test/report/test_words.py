@@ -185,3 +185,14 @@ def test_a_drift_is_named_though_it_shows_between_neighbours_too(successive, nea
     noise = Noise(6.0, None, False, successive, near, ('successive', 'near'))
     assert ('warm up' in words.drift_in_words(noise)) == drifting
     assert words.drifts(replace(noise, shared=('near',))) is False
+
+
+def test_errors_of_pure_numbers_have_a_unit_that_exists():
+    """It was "m1"."""
+    problem = problem_of(effects=('ratio',))
+    report = report_of(problem, identify(problem))
+    (table,) = (each for each in report.sections if each.name == 'parameters')
+    (row,) = (row for row in table.rows if row[0] == 'elbow_joint.ratio')
+    value, unit = float(row[1]), row[5]
+    assert (unit, f'{1e3 * value:+.4f}') == ('‰', row[2])
+    assert any(text.endswith(' ‰') for text in table.text)
