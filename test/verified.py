@@ -39,7 +39,7 @@ def with_errors(arm, errors):
 
 def verification_page(chain, sets, found):
     """Return the page of a verification of an arm by some observations."""
-    poses = poses_to_verify(chain, sets, found.comparison)
+    poses = poses_to_verify(found.chain, sets, found.comparison)
     return verification_report(chain, found, poses, Origin())
 
 

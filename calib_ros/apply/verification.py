@@ -106,6 +106,8 @@ class Verification(Shown):
     """Share of the RMS error that remains without one common shift and turn of all positions."""
     by_program: bool
     """Whether the wanted poses are those of the uncorrected program."""
+    chain: Chain
+    """The calibrated arm, in the fitted frames."""
     fitted: tuple[str, ...] = ()
     """Frames fitted to the new measurements."""
     reused: float = 0.0
@@ -166,8 +168,7 @@ def verify(
 
     `sets` are new measurements of poses or positions, in the frames of the calibration. Without a
     `tolerance`, the largest acceptable RMS position error [m], the verdict is whether the
-    calibration holds: the limit is then `Calibration.limit`. `confidence` is that of the interval;
-    `progress` receives the share done.
+    calibration holds, by `Calibration.limit`. `progress` receives the share done.
 
     With `new_base` the measuring device was moved, with `new_tool` the target replaced or
     remounted. Their frames are fitted, which absorbs the errors of two configurations and of one.
@@ -180,7 +181,7 @@ def verify(
     fitted = ('base',) * new_base + ('tool',) * new_tool
     _check(arm, sets, fitted)
     group = configurations(np.concatenate([each.joints for each in sets]))
-    comparison, left, uncorrected = _compared(arm, sets, commanded, fitted, group)
+    comparison, left, uncorrected, chain = _compared(arm, sets, commanded, fitted, group)
     progress(2 / 3)
     moments = moments_of(comparison.after.position, group) + SAME**2 * np.eye(3)  # without noise
     lost = IN_A_FRAME // 3 * new_base + new_tool  # the turn of a tool does not move the target
@@ -204,6 +205,7 @@ def verify(
         needed=needed,
         common=1.0 if new_base or np.isinf(left) else left / rms,
         by_program=commanded is not None,
+        chain=chain,
         fitted=fitted,
         reused=reused,
         outside=arm.outside(sets),
@@ -220,11 +222,11 @@ def _compared(
     commanded: FloatArray | None,
     fitted: tuple[str, ...],
     group: Index,
-) -> tuple[Comparison, float, bool]:
+) -> tuple[Comparison, float, bool, Chain]:
     """Return the residuals, and their RMS [m] over configurations (N,) without a common motion.
 
     The latter is infinite for pixels, which have no positions. And whether all were measured at
-    the commanded joint values, not at corrected ones.
+    the commanded joint values, not at corrected ones, and the arm in its fitted frames.
     """
     before, after = arm.before, arm.chain
     wanted, uncorrected = sets, False
@@ -241,7 +243,8 @@ def _compared(
     if all(each.pixels is None for each in sets):
         shaped = compare(before, _rebased(after, wanted), wanted).after
         left = _rms(moments_of(shaped.position, group), IN_A_FRAME // 3)
-    return replace(compare(before, after, sets), after=reached), left, uncorrected
+    chain = replace(arm.chain, base=after.base, tool=after.tool, frames=after.frames)
+    return replace(compare(before, after, sets), after=reached), left, uncorrected, chain
 
 
 def _mistake(

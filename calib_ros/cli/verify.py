@@ -80,7 +80,7 @@ def _verified(
         return status, file
     read = (options.measured, options.commanded, calibration_file(options.calibration))
     with screen.work('writing the report') as work:
-        poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
+        poses = poses_to_verify(found.chain, sets, found.comparison, by_line)
         origin = replace(inputs.origin_of(options, read), serial=serial)
         report = verdicts.verification_report(arm.chain, found, poses, origin, warnings)
         contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))

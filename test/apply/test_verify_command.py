@@ -12,10 +12,12 @@ from verified import NOISE, UR, in_words, measured, verification_page, with_erro
 
 from calib_ros import Calibration, Problem, identify, load_calibration
 from calib_ros.apply.candidates import Visibility
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.apply.verification import verify
 from calib_ros.cli.common import Status
 from calib_ros.files.programs import joints_csv, read_joints
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Frame
 from calib_ros.report.verdicts import remarks, standing
 
 
@@ -69,6 +71,25 @@ def test_an_arm_without_correction_passes_only_with_a_remark(cell, folder, run):
         status, out, _ = run(*judge, *more)
         assert status == wanted
         assert ('This judges the calibration' in ' '.join(out.split())) == (not more)
+
+
+def test_errors_are_along_the_axes_of_the_base_wherever_the_device_stands(cell, folder, run):
+    """They were turned by the frame of the device where it had stood before."""
+    worse = cell[0].with_offsets({'elbow_joint.a': 2e-3, 'wrist_1_joint.alpha': 2e-3})
+    place = Frame(random_frame(np.random.default_rng(5), 1.0).matrix @ worse.base.matrix)
+    tool = Frame(worse.tool.matrix @ random_frame(np.random.default_rng(6), 0.1).matrix)
+    q, found = UR.random_joints(20, np.random.default_rng(4)), []
+    for true in (replace(worse, tool=tool), replace(worse, base=place, tool=tool)):
+        write_csv(folder / 'measured.csv', rows_of(measured(true, q, 1, (0, 0)), 0))
+        run(*VERIFY, 'result', '--new-base', '--new-tool', '--out', 'out', '--force')
+        text = (folder / 'out' / 'residuals.csv').read_text()
+        rows = np.genfromtxt(text.splitlines(), delimiter=',', names=True)
+        axes = [f'{what}{k}' for what in ('', 'before_', 'after_', 'after_r') for k in 'xyz']
+        found.append(np.array([rows[name] for name in axes]))
+    there = (se3.invert(worse.base.matrix) @ replace(worse, tool=tool).forward(q))[:, :3, 3].T
+    assert np.abs(found[0][6:9]).max() > 1e-3
+    assert np.abs(found[0][:3] + found[0][6:9] - there).max() < 3e-3
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-6)
 
 
 def test_rows_marked_test_are_judged_like_others(cell, folder, run):
