@@ -33,7 +33,7 @@ from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.decision import mistakes
-from calib_ros.decision.comparison import Comparison, compare
+from calib_ros.decision.comparison import Comparison, along_base, compare
 from calib_ros.decision.moved import Step
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.estimation.configurations import configurations
@@ -44,7 +44,7 @@ from calib_ros.estimation.robust import OUTLIER
 from calib_ros.estimation.start import in_new_frames, released
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.effects import coupled
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray, Index
@@ -81,7 +81,7 @@ class Verification(Shown):
     """Errors before and after a correction, and the verdict."""
 
     comparison: Comparison
-    """Residuals by the nominal and by the calibrated arm."""
+    """Residuals by the nominal and by the calibrated arm, along the axes of its base."""
     tolerance: float | None
     """Wanted RMS position error [m]."""
     limit: float | None
@@ -107,7 +107,7 @@ class Verification(Shown):
     by_program: bool
     """Whether the wanted poses are those of the uncorrected program."""
     chain: Chain
-    """The calibrated arm, in the fitted frames."""
+    """The calibrated arm in the frame of its base, with fitted tools."""
     fitted: tuple[str, ...] = ()
     """Frames fitted to the new measurements."""
     reused: float = 0.0
@@ -226,7 +226,7 @@ def _compared(
     """Return the residuals, and their RMS [m] over configurations (N,) without a common motion.
 
     The latter is infinite for pixels, which have no positions. And whether all were measured at
-    the commanded joint values, not at corrected ones, and the arm in its fitted frames.
+    the commanded joint values, not at corrected ones, and the arm in the frame of its base.
     """
     before, after = arm.before, arm.chain
     wanted, uncorrected = sets, False
@@ -238,13 +238,15 @@ def _compared(
         wanted = [replace(s, joints=q) for s, (q, _) in zip(sets, found, strict=True)]
         uncorrected = not any(corrected.any() for _, corrected in found)
     before, after = _in_new_frames(before, sets, fitted), _in_new_frames(after, wanted, fitted)
-    reached = compare(before, after, wanted).after
+    pair = compare(before, after, sets).before, compare(before, after, wanted).after
     left = np.inf
     if all(each.pixels is None for each in sets):
         shaped = compare(before, _rebased(after, wanted), wanted).after
         left = _rms(moments_of(shaped.position, group), IN_A_FRAME // 3)
-    chain = replace(arm.chain, base=after.base, tool=after.tool, frames=after.frames)
-    return replace(compare(before, after, sets), after=reached), left, uncorrected, chain
+    first, last = (along_base(each, after, sets) for each in pair)
+    own = ((name, Frame() if name[:4] == 'base' else each) for name, each in after.frames)
+    chain = replace(arm.chain, base=Frame(), tool=after.tool, frames=tuple(own))
+    return Comparison(first, last, np.ones(len(group), dtype=bool)), left, uncorrected, chain
 
 
 def _mistake(

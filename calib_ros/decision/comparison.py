@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -160,6 +160,16 @@ def compare(
     )
     every = np.ones(len(numbers), dtype=bool)
     return Comparison(first, last, every if judged is None else judged)
+
+
+def along_base(found: Residuals, chain: Chain, sets: Sequence[Observations]) -> Residuals:
+    """Return residuals of sets along the axes of the arm's base, which all devices share."""
+    turns = [np.tile(chain.frame(each.base).matrix[:3, :3], (len(each), 1, 1)) for each in sets]
+    position, orientation = (
+        np.einsum('nc,ncd->nd', part, np.concatenate(turns))
+        for part in (found.position, found.orientation)
+    )
+    return replace(found, position=position, orientation=orientation)
 
 
 def joined(

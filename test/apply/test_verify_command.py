@@ -28,6 +28,7 @@ def folder(arm, run, tmp_path):
     return tmp_path
 
 
+KEPT = ('chain', 'before')
 VERIFY = ('verify', 'measured.csv', '--chain', 'ur10e', '--calibration')
 
 
@@ -90,6 +91,24 @@ def test_errors_are_along_the_axes_of_the_base_wherever_the_device_stands(cell, 
     assert np.abs(found[0][6:9]).max() > 1e-3
     assert np.abs(found[0][:3] + found[0][6:9] - there).max() < 3e-3
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-6)
+
+
+def test_errors_by_pose_are_those_of_each_device(arm):
+    """Errors seen by devices that stand otherwise were averaged along their own axes."""
+    rng = np.random.default_rng(7)
+    place, base = random_frame(rng, 1.0).matrix, arm.chain.frame('base').matrix
+    other = Frame(place @ base)
+    both = replace(arm, **{k: getattr(arm, k).with_frame('base_B', other) for k in KEPT})
+    seen = measured(arm.chain, UR.random_joints(6, rng), 5, (5e-5, 0.0))
+    seen = replace(seen, positions=seen.positions + base[:3, :3] @ [0.0, 0.0, 1e-3])
+    turned = place[:3, :3] @ seen.rotations
+    positions = seen.positions @ place[:3, :3].T + place[:3, 3]
+    sets = [seen, replace(seen, positions=positions, rotations=turned, base='base_B')]
+    found = verify(both, sets, 5e-3)
+    assert [each.cycles for each in found.each] == [10] * 6
+    for each in found.each:
+        assert each.after == pytest.approx(1.0, abs=0.1)
+        assert each.repeatability < 0.3
 
 
 def test_rows_marked_test_are_judged_like_others(cell, folder, run):
