@@ -129,6 +129,16 @@ def test_what_a_bag_cannot_hold_is_not_made_up(run, tmp_path, columns, cells):
     assert (status, 'a bag can hold only poses or positions of one' in err) == (1, True)
 
 
+def test_what_a_bag_leaves_out_is_told(run, tmp_path):
+    more = {f's{k}': 1 for k in range(1, 7)}
+    more |= {f'c{i}{j}': 1e-8 * (i == j) for i in range(1, 7) for j in range(i, 7)}
+    rows = [row | more for row in rows_of(measured(), 0)]
+    table = write_csv(tmp_path / 'cell.csv', rows)
+    status, _, err = run('csv2bag', table, tmp_path / 'bag', '--chain', 'ur5e')
+    told = 'note: the bag has no covariances, signs s1 ... of the table: its result may differ\n'
+    assert (status, err) == (0, told)
+
+
 def test_a_simulation_is_repeated_by_its_seed(run, tmp_path):
     truths = {}
     for name, seed in (('a', 1), ('b', 1), ('c', 2)):
