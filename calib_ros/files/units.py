@@ -146,7 +146,7 @@ class Units:
             called = ' '.join(map(self._sheet.called, each.names))
             remedy = 'name the right column (--columns)'
             if unit not in UNIT_SIGNS:
-                remedy = f'give --{option}, or convert it: --columns {ours}={{{called}}}*FACTOR'
+                remedy = f'give --{option}, or convert it: --columns "{ours}={{{called}}}*FACTOR"'
             elif self._chain is None and ours[0] == 'q':
                 remedy += ', or give --chain if it is prismatic'
             raise InputError(

@@ -14,10 +14,11 @@ LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254, 'ft': 0.3
 """Metres in units of length."""
 ANGLES = {'rad': 1.0, 'deg': np.pi / 180.0}  # radians in units of angle
 LONG = {'degree': 'deg', 'radian': 'rad', 'meter': 'm', 'centimeter': 'cm', 'millimeter': 'mm'}
-LONG |= {'micrometer': 'um', 'micron': 'um'}
+LONG |= {'micrometer': 'um', 'micron': 'um', 'degré': 'deg', 'grado': 'deg', 'grau': 'deg'}
 LONG |= {f'{word[:-2]}re': unit for word, unit in LONG.items() if word.endswith('meter')}
 UNIT_SIGNS = {word + s: unit for word, unit in LONG.items() for s in ('', 's')}
-UNIT_SIGNS |= {'°': 'deg', 'µm': 'um', 'μm': 'um', 'inch': 'in', 'inches': 'in'}
+UNIT_SIGNS |= {'°': 'deg', 'º': 'deg', '˚': 'deg', 'gradi': 'deg'}  # Grad may be gon
+UNIT_SIGNS |= {'µm': 'um', 'μm': 'um', 'inch': 'in', 'inches': 'in'}
 UNIT_SIGNS |= {'foot': 'ft', 'feet': 'ft'}
 UNIT_SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
 """Units by their signs and words in small letters."""
@@ -29,9 +30,13 @@ UNIT = re.compile(
 )
 """A name with its unit: X [mm], X (mm), X / mm, X_mm, X-mm; brackets may hold something else."""
 UNITS_ARE = re.compile(
-    rf'\bunits?\b(?:\W*[:=\t]\W*({_ANY})|\W*(?:are )?(?:in )?({_WORDS}))\b(?:\W+({_ANY})\b)?', re.I
+    r'\b(?:(?:unit[aeéà]?s?|unidade?s?|\w*einheit(?:en)?)(?: (?:of|di|de) \w+)?'
+    rf'(?:\W*[:=\t]\W*({_ANY})|\W*(?:are )?(?:in )?\W?({_WORDS}))'
+    r'|(?:values|dimensions|coordinates|angles|werte|angaben|winkel)\W*(?:are )?in '
+    rf'\W?({_WORDS}))(?!\w)(?:\W+(?:and |und |et |e |y )?({_ANY})(?!\w))?',
+    re.I,
 )
-"""Units in words: `Length Units = m`, `Units: mm, deg`, `units are in mm`."""
+"""Units in words: `Length Units = m`, `Einheiten: mm, °`, `all values are in mm`."""
 SECONDS = ('', 's', 'sec', 'second', 'seconds')
 
 SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'bar': '|', 'space': ' '}
