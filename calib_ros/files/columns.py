@@ -86,6 +86,7 @@ class Columns:
         if cut and cut[1].lower() in UNIT_SIGNS:
             remedy = f'write its unit into the header, {called.split(" [")[0]} [{cut[1]}]'
         words = bare.lower() not in MISSING and not re.search('[0-9]', bare)
+        words |= re.match(r'#|%|//|[^\W\d_]{2}', bare) is not None  # Run 2, # page 2
         if words and row == 0:  # perhaps, as other tables have below their header
             remedy += '; units belong into the header: q1 [deg]'
         return (ColumnsError if words or (commas and not row) else InputError)(

@@ -39,6 +39,8 @@ NOMINAL_WORDS = _set(
     'setpoint theo theoretical ideal cad design model calc computed pred predicted sim simulated '
     'prog programmed planned tcp ee robot fk'
 )
+NOMINAL_TITLES = NOMINAL_WORDS - _set('target robot tcp ee model ref reference design prog fk')
+"""Words that call the rows below a title nominal; others are of any cell."""
 DEVIATION = _set('d dev deviation delta dif diff difference abw abweichung')
 TURNED = _set('q quat quaternion orientation rot rotation')
 DISTANCE_WORDS = _set('distance length wire abstand')

@@ -29,6 +29,7 @@ from calib_ros.files.columns import (
 )
 from calib_ros.files.headers import name_and_unit, only, places
 from calib_ros.files.layouts import Layout
+from calib_ros.files.skipped import refuse_nominal, without_words
 from calib_ros.files.vocabulary import (
     DECIMAL_COMMA,
     MISSING,
@@ -43,7 +44,6 @@ from calib_ros.texts import LARGEST_TABLE, read_bytes
 
 HEAD_LINES = MOST_ENTRIES // 10
 """Lines searched for the header and the first row of numbers."""
-COMMENTS = ('#', '%', '//')
 LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
 
 
@@ -160,33 +160,17 @@ def _sheet(
     above = head[: first if at < 0 else at]
     left: list[Cells] = []
     again = [cells for _, cells in head[at:first]]
-    body = _without_words(chain([whole[first:]], rows), again, left)
+    body = without_words(chain([whole[first:]], rows), again, left)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
     if at >= 0 and max(used, default=0) < len(header):
         _refuse_shifted(columns, len(header))
+    refuse_nominal(columns, [*above, *left])
     if left:
         without = lines_in_words([line for line, _ in left])
         notes.append(f'there are no numbers in {without}: skipped')
     header = (*header, *[''] * (len(columns.header) - len(header)))
     words = (*content.comments, *('\t'.join(cells) for _, cells in (*above, *left)))
     return Sheet(path, header, words, replace(columns, decimal=decimal), tuple(notes))
-
-
-def _without_words(
-    blocks: Iterable[list[Cells]], head: Sequence[list[str]], left: list[Cells]
-) -> Iterator[list[Cells]]:
-    """Yield the rows but comments, remarks and the `head` again, which go into a list."""
-    for block in blocks:
-        words = [
-            (line, cells)
-            for line, cells in block
-            if (
-                len(cells) - cells.count('') <= 2 or cells[0].startswith(COMMENTS) or cells in head
-            )
-            and not any(_is_number(cell, ',') for cell in cells)
-        ]
-        left += words
-        yield [row for row in block if row not in words] if words else block
 
 
 def _refuse_shifted(columns: Columns, width: int) -> None:

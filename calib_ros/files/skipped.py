@@ -4,16 +4,18 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby, product
 from typing import TypeAlias
 
 import numpy as np
 
 from calib_ros.errors import LONGEST, MOST_ENTRIES, InputError
-from calib_ros.files.columns import BETWEEN, Columns, lines_in_words
+from calib_ros.files.columns import BETWEEN, Cells, Columns, cell_number, lines_in_words
+from calib_ros.files.names import MEASURED_WORDS, NOMINAL_TITLES, words_of
 from calib_ros.files.vocabulary import MEASURED_COLUMNS, POSITION
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.values import ROUNDED
@@ -50,6 +52,46 @@ STATISTICS: tuple[Statistic, ...] = (
     lambda columns: np.full(columns.shape[1], len(columns)),
 )
 """Statistics that a table may have, a row each."""
+
+COMMENTS = ('#', '%', '//')
+
+
+def without_words(
+    blocks: Iterable[list[Cells]], head: Sequence[list[str]], left: list[Cells]
+) -> Iterator[list[Cells]]:
+    """Yield the rows but comments, remarks and the `head` again, which go into a list."""
+    for block in blocks:
+        words = [
+            (line, cells)
+            for line, cells in block
+            if (
+                len(cells) - cells.count('') <= 2 or cells[0].startswith(COMMENTS) or cells in head
+            )
+            and not any(math.isfinite(cell_number(cell, ',')) for cell in cells)
+        ]
+        left += words
+        yield [row for row in block if row not in words] if words else block
+
+
+def refuse_nominal(columns: Columns, remarks: Iterable[Cells]) -> None:
+    """Refuse rows below a title that calls them nominal, if other rows are below another one.
+
+    A title is a remark of at most three words; remarks above the header come first.
+    """
+    titles = [(0, False, '')]
+    for line, cells in remarks:
+        words = words_of(text := ' '.join(filter(None, cells)))
+        if len(words) <= 3 and {*words} & (NOMINAL_TITLES | MEASURED_WORDS):
+            titles.append((line, bool({*words} & NOMINAL_TITLES), text))
+    ends = np.searchsorted(columns.lines, [line for line, *_ in titles])
+    counts = np.diff(ends, append=len(columns.lines))
+    held = [title for title, count in zip(titles, counts.tolist(), strict=True) if count]
+    for line, nominal, text in held:
+        if nominal and not all(each for _, each, _ in held):
+            raise InputError(
+                f'{columns.path}, line {line}: the rows below "{text}" may be nominal, others are '
+                'not called so: leave out those that were not measured, or that line'
+            )
 
 
 def measured(made: Columns) -> tuple[Columns, tuple[str, ...]]:

@@ -171,6 +171,8 @@ def test_lost_targets_are_known_in_any_unit(tmp_path):
         '// lost',
         'End of file',
         'Operator: Smith, 3 Nov',
+        'Run 2',
+        '# page 2',
         'q1,q2,x,y,z',
         'rad,rad,m,m,m',
         '----',
@@ -186,6 +188,32 @@ def test_remarks_and_headers_again_are_no_rows(tmp_path, row, place):
     for table in tables(path):
         assert_same(table, None)
         assert any(f'line {place + 3}' in note for note in table.warnings)
+
+
+@pytest.mark.parametrize('again', ['q1,q2,x,y,z\n', ''])
+@pytest.mark.parametrize(
+    ('titles', 'said'),
+    [
+        (('', 'Nominal'), 'line 5: the rows below "Nominal" may be nominal'),
+        (('Measured', 'Soll-Positionen'), 'line 6: the rows below "Soll-Positionen"'),
+        (('Commanded', 'Actual values'), 'line 1: the rows below "Commanded" may be nominal'),
+        (('', 'Robot 2'), ''),
+        (('Measured', 'Measured'), ''),
+        (('Nominal', 'Nominal, page 2'), ''),
+        (('', 'still at its nominal speed'), ''),
+    ],
+)
+def test_rows_below_a_title_that_calls_them_nominal_are_refused(tmp_path, titles, said, again):
+    """A table of nominal poses below the measured ones was read as more of these."""
+    path = tmp_path / 'cell.csv'
+    first, second = (f'{title}\n' * bool(title) for title in titles)
+    rows = PLAIN.partition('\n')[2].replace('0.25', '0.26')
+    path.write_text(f'{first}{PLAIN}{second}{again}{rows}')
+    if said:
+        with pytest.raises(InputError, match=said):
+            loading.table(path, ARM, Settings())
+    else:
+        assert len(loading.table(path, ARM, Settings()).fitted[0]) == 6
 
 
 def test_a_row_of_words_in_place_of_numbers_is_refused(tmp_path):
