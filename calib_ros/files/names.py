@@ -32,23 +32,27 @@ def _set(words: str) -> frozenset[str]:
 
 MEASURED_WORDS = _set(
     'meas measured measurement act actual true truth ist istwert fbk feedback tracker leica laser '
-    'faro vicon'
+    'faro vicon gemessen mesuré mesurée misurato misurata medido medida réel réelle reale'
 )
 NOMINAL_WORDS = _set(
     'nom nominal cmd command commanded target soll sollwert ref reference des desired goal '
     'setpoint theo theoretical ideal cad design model calc computed pred predicted sim simulated '
-    'prog programmed planned tcp ee robot fk'
+    'prog programmed planned tcp ee robot fk théorique teorico teórico nominale consigne'
 )
 NOMINAL_TITLES = NOMINAL_WORDS - _set('target robot tcp ee model ref reference design prog fk')
 """Words that call the rows below a title nominal; others are of any cell."""
 DEVIATION = _set('d dev deviation delta dif diff difference abw abweichung')
 TURNED = _set('q quat quaternion orientation rot rotation')
 DISTANCE_WORDS = _set('distance length wire abstand')
-JOINT_WORDS = _set('q j a joint joints axis achse axe position pos theta th angle')
+JOINT_WORDS = _set(
+    'q j a joint joints axis achse axe position pos theta th angle winkel gelenk eje asse giunto '
+    'articulation articulación junta eixo'
+)
 NO_JOINT = _set(
     'vel velocity speed qd acc acceleration qdd force torque moment tau effort load currents '
     'voltage power temp temperature std stdev sd sigma err error rms var uncertainty status mode '
-    'count counts'
+    'count counts strom drehmoment geschwindigkeit courant couple vitesse corriente velocidad '
+    'corrente coppia velocità schleppfehler'
 )
 OTHER = NO_JOINT | _set('r s u v a f e n g normal twist angular angle euler rotvec omega gyro')
 """Other quantities that have coordinates, too."""

@@ -57,6 +57,9 @@ def proposed(path, said='.*'):
         ('{}', '{}_meas'),
         ('{}', 'Actual {}'),
         ('{}', 'Tracker {}'),
+        ('{} théorique', '{} mesuré'),
+        ('{} nominale', '{} misurata'),
+        ('{} teórico', '{} medido'),
         ('{}', '{}_true'),
         ('{}_corr', '{}_true'),
     ],
@@ -128,6 +131,11 @@ def test_plain_coordinates_may_be_nominal_beside_any_others(tmp_path, form, ours
         ('actual_joint_voltage_{}', 'J{}'),
         ('q{}_act_speed', 'J{}'),
         ('q{}_meas_std', 'A{}'),
+        ('Strom{}', 'Winkel{}'),
+        ('Schleppfehler A{}', 'A{}'),
+        ('Consigne axe {}', 'Position axe {}'),
+        ('corriente{}', 'eje{}'),
+        ('coppia{}', 'asse{}'),
     ],
 )
 def test_other_values_are_not_taken_for_measured_joints(tmp_path, first, second):
