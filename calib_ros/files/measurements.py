@@ -205,9 +205,10 @@ def measurements(columns: Columns, joints: int) -> Measurements:
     _check_header(columns, joints)
     filled = np.array([~columns.blank(name) for name in KINDS])
     for row in np.flatnonzero(filled.sum(axis=0, dtype=np.uint8) > 1)[:1].tolist():
-        kinds = ' and '.join(np.array(KINDS)[filled[:, row]])
+        kinds = np.array(KINDS)[filled[:, row]].tolist()
         raise InputError(
-            f'{columns.path}, line {columns.lines[row]} has both {kinds}: give each its own row'
+            f'{columns.path}, line {columns.lines[row]} has both {" and ".join(kinds)}: give each '
+            f'its own row, or rename the column {kinds[-1]} if it is no measurement of its own'
         )
     kind = filled.argmax(axis=0)
     placed = kind == POSE

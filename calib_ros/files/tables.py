@@ -63,6 +63,8 @@ def read_table(
     elif path.is_file():  # a pipe can be read once only
         read = of_journal(path, joints, progress)
     found, warnings = read or _of_csv(path, joints, progress)
+    found, more = _without_names(found)
+    warnings = (*warnings, *more)
     rows, by_line = _chosen(found, joints, sessions), 'stamp_ns' not in found.cells
     return _dataset(rows, sigmas, eye_in_hand, warnings, by_line)
 
@@ -98,6 +100,18 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
         notes += turns_in(path, [name_and_unit(name)[0] for name in found.header])
     known = {*columns(joints), *TURNS, 'plane', f'q{joints + 1}'}
     return kept, (*notes, *not_read(path, [name for name in cells if name not in known]))
+
+
+def _without_names(found: Columns) -> tuple[Columns, tuple[str, ...]]:
+    """Return columns without those of targets or devices that name each row another, and notes.
+
+    SpatialAnalyzer calls a point so.
+    """
+    count = len(found.lines)
+    names = [n for n in ('target', 'device') if len(found.labels(n)[1]) == count > len(POSITION)]
+    cells = {name: given for name, given in found.cells.items() if name not in names}
+    told = '{}: the column {} has another name in each row: it is left out, as a name of poses'
+    return replace(found, cells=cells), tuple(told.format(found.path, name) for name in names)
 
 
 def _chosen(found: Columns, joints: int, sessions: Sequence[str]) -> Measurements:
@@ -167,4 +181,5 @@ def check_table(made: Columns) -> None:
             'chain with those joint names (--chain), or their separate table (--joints)'
         )
     sessions = made.texts('session') if 'session' in made.cells else ()
+    made, _ = _without_names(made)
     _dataset(_chosen(made, joints, tuple(dict.fromkeys(sessions))))

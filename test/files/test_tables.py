@@ -139,7 +139,7 @@ FAULTS = [
       for each in ('nan', 'inf', '-inf', '', ' ', 'twelve', '1;2')),
     (POINTS.replace('5.5', '5.5 mm'), r'y must be .*: write its unit into the header, y \[mm\]'),
     (POINTS.replace('5.5', '"0,5"'), "line 3: y must be .*, not '0,5': write a point"),
-    ('q1,q2,x,y,z,distance\n0,0,1,2,3,\n0,0,1,2,3,4\n', 'line 3 has both .* and distance: give'),
+    ('q1,q2,x,y,z,distance\n0,0,1,2,3,\n0,0,1,2,3,4\n', 'has both x and distance: .*, or rename'),
     ('q1,q2,location,socket\n0,0,A,1\n0,0,B,1_2\n', 'line 3: socket must be LOCATION/SOCKET'),
     *((POINTS.replace('5.5', each), r'cell\.csv, line 3: y must be') for each in
       ('1e160', '-1e7', '²')),
@@ -150,7 +150,7 @@ FAULTS = [
     (f'{POINTS}0,0,1,2,3,4\n', 'line 4: more values than the 5 columns'),
     (f'{POINTS}{"0," * 600_000}\n', 'a line of more than 1000000 bytes'),
     (','.join(f'c{k}' for k in range(100_000)) + '\n1' * 100_000, '100000 columns'),
-    ('q1,q2,x,y,z,device\n' + ''.join(f'0,0,1,2,3,d{k}\n' for k in range(200)),
+    ('q1,q2,x,y,z,device\n' + ''.join(f'0,0,1,2,3,d{k % 199}\n' for k in range(200)),
      'line 102: more than 100 sessions'),
     (POINTS.encode('utf-16'), 'not UTF-8 text, line 1 has zero bytes'),
     ('q1,é\n0,1\n'.encode('latin-1'), 'not UTF-8 text: save it as UTF-8'),
@@ -266,6 +266,20 @@ def test_a_name_in_another_case_is_told_and_two_are_not_read(tmp_path):
     assert read_table(path, 2).warnings == (f'{path}: the column Target is read as target',)
     path.write_text('q1,q2,x,y,z,Target,TARGET\n0,0,1,2,3,a,b\n')
     assert 'columns not read: Target, TARGET (' in read_table(path, 2).warnings[0]
+
+
+@pytest.mark.parametrize('separator', [',', ';'])
+def test_a_name_of_poses_is_no_target(tmp_path, separator):
+    """SpatialAnalyzer calls a point so: each row had a frame of its own to be fitted."""
+    path = tmp_path / 'cell.csv'
+    rows = [f'{k}e-1,0,1,2,3,P{k}' for k in range(4)]
+    path.write_text('\n'.join(['q1,q2,x,y,z,Target', *rows, '']).replace(',', separator))
+    arm = Chain('arm', 'standard', (Joint('a'), Joint('b')))
+    table = loading.table(path, arm, Settings())
+    assert [len(each) for each in table.fitted] == [4]
+    assert 'the column target has another name in each row' in table.warnings[-1]
+    path.write_text(path.read_text().replace('P3', 'P2'))
+    assert len(loading.table(path, arm, Settings()).fitted) == 3
 
 
 def test_one_column_has_a_line_for_each_row(tmp_path):
