@@ -110,7 +110,8 @@ class Foreign:
             raise InputError(
                 f'{log.path} has {len(joints.lines)} rows, {table.path} has {len(made.lines)}: '
                 'give both a column that names the poses, or a row for each measurement (rows '
-                'without values do not count)'
+                'without values do not count). Times are not interpolated: of recordings keep one '
+                'row for each stop, or record both in a bag'
             )
         joints = joints.select(partners)
         for ours in filter(re.compile('q[0-9]+').fullmatch, joints.cells):
@@ -293,12 +294,16 @@ class _Table:
 def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
     """Return a column that names the poses of both, if any, and the row in the log of each.
 
-    If one names most of them, the others are refused.
+    If one names most of them, the others are refused. Numbers may only count the rows of
+    each: they name poses if no words do.
     """
     refused = ''
-    for (kind, name, named), (same, theirs, logged) in product(
-        table.labels(log), [*log.labels(table)]
-    ):
+    both = product(
+        sorted(table.labels(log), key=lambda each: each[0] != ''), [*log.labels(table)]
+    )  # words first
+    for (kind, name, named), (same, theirs, logged) in both:
+        if kind and refused:
+            break
         if kind != same:
             continue
         ours, others = Counter(named), Counter(logged)
