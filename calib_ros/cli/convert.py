@@ -12,15 +12,17 @@ from calib_ros.atomic import write_file
 from calib_ros.cli import common, inputs
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
-from calib_ros.errors import InputError
+from calib_ros.errors import CalibrationError, InputError
 from calib_ros.estimation.observations import Observations
+from calib_ros.files import loading
 from calib_ros.files.columns import as_csv
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.journal import table_text
 from calib_ros.files.layouts import Layout
 from calib_ros.files.recording import Recording, write_bag
-from calib_ros.files.tables import check_table, read_table
+from calib_ros.files.tables import check_table
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.settings import Settings
 
 
 def _convert(options: argparse.Namespace, screen: Screen) -> int:
@@ -43,7 +45,14 @@ def _convert(options: argparse.Namespace, screen: Screen) -> int:
 def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.csv, 'csv2bag', 'table')
     chain = load_chain(options.chain)
-    table = read_table(options.csv, len(chain.joints), common.sessions_of(options))
+    try:
+        table = loading.table(options.csv, chain, Settings(), common.sessions_of(options))
+    except CalibrationError as err:
+        if '--' in (told := str(err)):
+            told += '; these are options of calib_ros import, whose table csv2bag takes'
+        raise InputError(told) from err
+    for warning in table.warnings:
+        screen.warn(warning)
     every = [*table.fitted, *table.held_out]
     oriented = any(each.oriented.any() for each in every)
     if (

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from measured import FIGURES, TEST, TRAIN, TRUE, UR, measured, rows_of, write_csv
 
+from calib_ros import read_table
 from calib_ros.apply.simulation import random_frame
 from calib_ros.cli.common import SETTINGS, Status
 from calib_ros.cli.identify import RESULT_FILES
@@ -137,6 +138,21 @@ def test_what_a_bag_leaves_out_is_told(run, tmp_path):
     status, _, err = run('csv2bag', table, tmp_path / 'bag', '--chain', 'ur5e')
     told = 'note: the bag has no covariances, signs s1 ... of the table: its result may differ\n'
     assert (status, err) == (0, told)
+
+
+@pytest.mark.parametrize('name', ['q', 'A'])
+def test_a_bag_is_made_of_any_table_that_identify_reads(run, tmp_path, name):
+    """Its message proposed options that csv2bag does not have."""
+    header = ';'.join([*(f'{name}{k} [deg]' for k in range(1, 7)), 'X [mm];Y [mm];Z [mm]'])
+    (tmp_path / 'table.csv').write_text(f'{header}\n0;90;0;0;0;0;1;2,5;3\n0;0;9;0;0;0;1;2;3\n')
+    status, _, err = run('csv2bag', 'table.csv', 'bag', '--chain', 'ur5e')
+    assert status == (name != 'q')
+    assert 'options of calib_ros import' in err if status else 'decimal commas' in err
+    if not status:
+        run('bag2csv', 'bag', 'back.csv', '--chain', 'ur5e')
+        first = read_table(tmp_path / 'back.csv', 6).fitted[0]
+        np.testing.assert_allclose(first.joints[0], [0, np.pi / 2, 0, 0, 0, 0], atol=1e-9)
+        np.testing.assert_allclose(first.positions[0], [1e-3, 2.5e-3, 3e-3], atol=1e-9)
 
 
 def test_a_simulation_is_repeated_by_its_seed(run, tmp_path):
