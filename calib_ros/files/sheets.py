@@ -245,9 +245,10 @@ def _text(path: Path) -> tuple[str, str]:
         except UnicodeDecodeError as err:
             raise InputError(f'cannot read {path}: {err}') from err
     if b'\0' in data:
-        raise InputError(
-            f'cannot read {path}: it is not text, and not a workbook by its name (.xlsx)'
-        )
+        told = 'is not text, and not a workbook by its name (.xlsx)'
+        if path.suffix.lower() in SHEETS:
+            told = 'is a workbook, expected a table as text: save the sheet as CSV'
+        raise InputError(f'cannot read {path}: it {told}')
     with suppress(UnicodeDecodeError):
         return data.decode('utf-8-sig'), ''
     return data.decode('cp1252', errors='replace'), 'Windows-1252, because it is not UTF-8'

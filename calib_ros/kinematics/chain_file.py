@@ -67,8 +67,18 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
         robots = shipped_robots()
         if (name := str(name_or_path).lower()) not in robots:
             another = 'another arm needs a URDF or a chain file'  # a UR5 is no UR5e
+            if path.is_dir():
+                raise ConfigError(
+                    f'{path} is a folder, no arm: give the name of a robot, a URDF or a chain '
+                    'file; of a result, the calibration.yaml in it is one'
+                )
             raise UnknownNameError('robot', str(name_or_path), robots, another)
         path = robots[name]
+    elif path.suffix.lower() not in ('', '.yaml', '.yml'):
+        raise ConfigError(
+            f'{path} is no chain file (.yaml) or URDF: give the arm, by its file or name, as '
+            '--chain, and measurements without an option'
+        )
     chain = parse_chain(chain_text(path), str(path))
     _refuse_other_units(chain, str(path))
     return chain

@@ -32,7 +32,7 @@ def bad_inputs():
     yield 'an empty bag folder', (*bag_of, 'folder'), 'no .mcap or .db3 file is in it'
     yield 'a chain as table', (*bag_of, 'broken.yaml'), 'but identify takes a table or a bag'
     yield 'no such robot', (*chain_of, 'ur10x'), 'valid: abb_irb120'
-    yield 'no chain', (*chain_of, 'good.csv'), 'good.csv'
+    yield 'no chain', (*chain_of, 'good.csv'), 'good.csv is no chain file (.yaml) or URDF'
     yield 'another number of joints', (*chain_of, 'franka_panda'), 'q7'
     yield 'a frame is no parameter', (*good, '--fixed', 'base.x'), 'fixed: true'
     yield 'nothing left', (*good, '--fixed', '*'), 'every parameter is fixed: nothing is left to'
@@ -77,6 +77,9 @@ def bad_inputs():
     yield 'simulate, no poses', ('simulate', 'b', '--chain', 'ur5e', '--poses', '-1'), 'poses'
     yield 'simulate, seed', ('simulate', 'b', '--chain', 'ur5e', '--seed', '-1'), 'seed'
     yield 'no calibration', ('compare', 'none', 'none'), 'at none: give the folder written by ide'
+    book = ('plan', '--chain', 'ur5e', '--candidates', 'poses.xlsx')
+    yield 'a workbook of candidates', book, 'poses.xlsx: it is a workbook, expected a table as te'
+    yield 'a folder as arm', (*chain_of, 'folder'), 'folder is a folder, no arm: '
     yield 'not accepted', ('compare', 'refused', 'none'), 'refused was not accepted'
     yield (
         'not accepted, named as a file',
@@ -85,7 +88,7 @@ def bad_inputs():
     )
     yield 'a folder as calibration', ('compare', 'folder', 'none'), 'folder holds no calibration.y'
     yield 'a table as calibration', ('compare', 'good.csv', 'none'), 'is a table, but compare'
-    yield 'a picture as chain', (*chain_of, 'shot.png'), 'shot.png is not UTF-8 text: save it'
+    yield 'a picture as chain', (*chain_of, 'shot.png'), 'shot.png is no chain file'
     yield (
         'a program of KUKA',
         (*bag_of, 'move.dat'),
@@ -126,6 +129,7 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     (tmp_path / 'move.dat').write_text('&ACCESS RVP\nDEFDAT MOVE\nENDDAT\n')
     (tmp_path / 'part.dat').write_text('DEFDAT MOVE\nDECL E6AXIS XP1={A1 1.0,A2 2.0}\nENDDAT\n')
     (tmp_path / 'start.dtx').write_text('<?xml version="1.0"?><Database/>')
+    (tmp_path / 'poses.xlsx').write_bytes(b'PK\3\4\0')
     (tmp_path / 'shot.png').write_bytes(b'\x89PNG\xff')
     for folder, file in (('folder', ''), ('refused', 'result.json'), ('shots', '1.pgm')):
         (tmp_path / folder).mkdir()
