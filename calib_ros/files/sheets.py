@@ -10,13 +10,11 @@ from __future__ import annotations
 import codecs
 import math
 import re
-import zipfile
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import accumulate, chain, zip_longest
 from pathlib import Path
-from typing import Any
 
 from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.columns import (
@@ -39,12 +37,12 @@ from calib_ros.files.vocabulary import (
     UNIT_SIGNS,
     UNITS_ARE,
 )
+from calib_ros.files.workbooks import sheets_of
 from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, read_bytes
 
 HEAD_LINES = MOST_ENTRIES // 10
 """Lines searched for the header and the first row of numbers."""
-LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,53 +254,10 @@ def _text(path: Path) -> tuple[str, str]:
 
 def _of_workbook(path: Path, name: str) -> Iterator[_Content]:
     """Yield the sheets with rows: the one named, or the visible ones."""
-    try:
-        import openpyxl
-    except ImportError as err:
-        raise InputError(
-            f'{path} needs openpyxl: pip install "calib_ros[xlsx]", or save it as CSV'
-        ) from err
-    try:
-        with zipfile.ZipFile(path) as packed:
-            size = sum(each.file_size for each in packed.infolist())
-        if size > LARGEST_SHEET:
-            raise InputError(f'{path} is larger than {LARGEST_SHEET // 10**6} MB when unpacked')
-        with closing(openpyxl.load_workbook(path, read_only=True, data_only=True)) as book:
-            titles = {each.title: each for each in book.worksheets}  # without charts
-            if name and name not in titles:
-                raise InputError(f'{path} has no sheet "{name}"; it has {", ".join(titles)}')
-            visible = [each for each in book.worksheets if each.sheet_state == 'visible']
-            for sheet in [titles[name]] if name else visible:
-                told = f'sheet "{sheet.title}" of {len(visible)} is read (--sheet)'
-                notes = [told] if len(visible) > 1 and not name else []
-                if rows := _rows(path, sheet):
-                    yield _Content(iter([rows]), notes, title=sheet.title)
-    except InputError:
-        raise
-    except zipfile.BadZipFile as err:
-        raise InputError(f'{path} is no workbook, or damaged: save it as .xlsx or CSV') from err
-    except Exception as err:  # a broken workbook fails in many ways
-        raise InputError(f'cannot read {path}: {" ".join(str(err).split())}') from err
-
-
-def _rows(path: Path, sheet: Any) -> list[Cells]:
-    """Return the rows of a sheet that are not empty, with their numbers."""
-    sheet.reset_dimensions()  # stated ones may be too small
-    rows: list[Cells] = []
-    for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
-        if len(row) > MOST_ENTRIES:
-            raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
-        cells = [_cell(value) for value in row]
-        if any(cells):
-            rows.append((number, cells))
-    return rows
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return ''
-    text = str(int(value) if isinstance(value, bool) else value)
-    return ' '.join(text.split())
+    for title, visible, rows in sheets_of(path, name):
+        told = f'sheet "{title}" of {visible} is read (--sheet)'
+        notes = [told] if visible > 1 and not name else []
+        yield _Content(iter([rows]), notes, title=title)
 
 
 def _separator(path: Path, text: str) -> str:

@@ -12,7 +12,7 @@ from test_foreign import JOINTS, NAMES, PLACES, PLAIN, TURNED, assert_same, text
 
 from calib_ros import Chain, Settings, read_table
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
-from calib_ros.files import loading, sheets
+from calib_ros.files import loading, workbooks
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, layout_of
 from calib_ros.files.vocabulary import MATRIX, SEPARATORS
@@ -392,7 +392,7 @@ def test_workbooks(tmp_path, monkeypatch):
         book.save(path)
         with pytest.raises(InputError, match=said):
             read_table(path, 2, foreign=Foreign(Layout(columns=columns)))
-    monkeypatch.setattr(sheets, 'LARGEST_SHEET', 100)
+    monkeypatch.setattr(workbooks, 'LARGEST_SHEET', 100)
     with pytest.raises(InputError, match='MB when unpacked'):
         read_table(path, 2, foreign=Foreign(Layout()))
     monkeypatch.setitem(sys.modules, 'openpyxl', None)
