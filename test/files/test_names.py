@@ -118,6 +118,8 @@ def test_plain_coordinates_may_be_nominal_beside_any_others(tmp_path, form, ours
     [
         ('q{}_cmd', 'q{}_act'),
         ('q{}', 'q{}_meas'),
+        ('q{}', 'q{}.1'),
+        ('q{}', 'q{} (2)'),
         ('target_q_{}', 'actual_q_{}'),
         ('tau{}', 'A{}'),
         ('qd{}', 'th{}'),
