@@ -32,8 +32,8 @@ UNIT = re.compile(
 UNITS_ARE = re.compile(
     r'\b(?:(?:unit[aeéà]?s?|unidade?s?|\w*einheit(?:en)?)(?: (?:of|di|de) \w+)?'
     rf'(?:\W*[:=\t]\W*({_ANY})|\W*(?:are )?(?:in )?\W?({_WORDS}))'
-    r'|(?:values|dimensions|coordinates|angles|werte|angaben|winkel)\W*(?:are )?in '
-    rf'\W?({_WORDS}))(?!\w)(?:\W+(?:and |und |et |e |y )?({_ANY})(?!\w))?',
+    r'|(?:values|dimensions|coordinates|positions|lengths|angles|werte|angaben|längen|winkel)'
+    rf'\W*(?:are )?in \W?({_WORDS}))(?!\w)(?:\W+(?:and |und |et |e |y )?({_ANY})(?!\w))?',
     re.I,
 )
 """Units in words: `Length Units = m`, `Einheiten: mm, °`, `all values are in mm`."""

@@ -163,6 +163,7 @@ def test_a_linear_axis_has_its_own_unit_in_the_header(tmp_path):
         ('Unidad: mm\nq1 (grados),q2,x,y,z', '90,180,1,2,3'),
         ('Alle Angaben in mm\nq1 [deg],q2,x,y,z', '90,180,1,2,3'),
         ('All values are in [mm]\nq1 [deg],q2,x,y,z', '90,180,1,2,3'),
+        ('Angles in deg; lengths in mm\nq1,q2,x,y,z', '90,180,1,2,3'),
         ('Tool [mm],120,Angle [deg],,\nq1 [deg],q2,x [mm],y,z', '90,180,1,2,3'),
         ('Cell\na [deg],b,c [mm],d,e', '90,180,1,2,3'),
         ('Cell\na,b,c,d,e\ndeg,deg,mm,mm,mm', '90,180,1,2,3'),
