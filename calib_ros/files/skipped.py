@@ -21,14 +21,16 @@ from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.values import ROUNDED
 
 _MEAN = (
-    r'(\w+[ _-])?(mean|average|avg|mittel(wert)?|moyenne|m[eé]dia|promedio|平均[値值]?)'
-    r'( value| error| of [\w ]+)?'
+    r'([^\W_]+[ _-]){0,3}(mean|average|avg|\w*mittel(wert)?|durchschnitt|ø|moy(enne)?|m[eé]dia'
+    r'|valore? medio|promedio|平均[値值]?)( value| error| of [\w ]+)?'
 )
 _OTHERS = (
-    r'median|max|maximum|min|minimum|range|spannweite|sum|total|summe|gesamt|count|anzahl'
-    r'|rms( error)?|([1-6] ?)?sigma'
+    r'median|max|maximum|m[aá](ss|x)imo|min|minimum|m[ií]nimo|range|spannweite|sum|(sub)?total'
+    r'|summe|gesamt|varianza?|dev\. ?st|teilergebnis|count|anzahl|rmse?( error)?'
+    r'|([1-6][ -]?)?(sigma|\u03c3)|streuung|stabw'
+    r'|(d[eé]viation|desviaci[oó]n|deviazione) (standard|est[aá]ndar)'
     r'|(\w+[ _-])?(st(andar)?d?[. -]*(dev(iation)?|err(or)?|abw(eichung)?)|std|sd)'
-    r'|var(iance)?|varianz|[ée]cart[- ]type|standardabweichung|標準偏差|标准差|tolerance|toleranz'
+    r'|var(iance)?|[ée]cart[- ]type|standardabweichung|標準偏差|标准差|tolerance|toleranz'
 )
 MEAN, STATISTIC = (
     re.compile(rf'(?:\A|{BETWEEN})\s*(?:{names})( ?[\[(]\S+[\])])?[ :.]*(?={BETWEEN}|\Z)', re.I)

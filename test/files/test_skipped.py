@@ -38,6 +38,11 @@ def tables(path):
         ('Variance,0.1,0.2,0.3,0.4,0.5', 'Count,3,3,3,3,3'),
         ('平均値,0.1,0.2,0.3,0.4,0.5', '標準偏差,1,1,1,1,1'),
         ('Mean error [mm],0.1,0.2,0.3,0.4,0.5', 'RMS error (mm),1,1,1,1,1'),
+        ('Group 1 Average,0.1,0.2,0.3,0.4,0.5',),
+        ('Durchschnitt,0.1,0.2,0.3,0.4,0.5', 'Streuung,1,1,1,1,1', '2\u03c3,1,1,1,1,1'),
+        ('Moyenne,0.1,0.2,0.3,0.4,0.5', 'Déviation standard,1,1,1,1,1'),
+        ('Valor medio,0.1,0.2,0.3,0.4,0.5', 'Desviación estándar,1,1,1,1,1', 'Máximo,1,1,1,1,1'),
+        ('Media,0.1,0.2,0.3,0.4,0.5', 'Deviazione standard,1,1,1,1,1', 'Minimo,1,1,1,1,1'),
         ('Mean of all points,0.1,0.2,0.3,0.4,0.5', 'Std.-Abw.,1,1,1,1,1'),
     ],
 )
