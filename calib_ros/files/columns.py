@@ -232,7 +232,7 @@ def columns_of(
     """
     blocks = csv_blocks(path, data, separator, strict=True, above=above)
     first: list[Cells] = next(blocks, [(above, [])])
-    header = [name.strip() for name in first[0][1]]
+    header = [' '.join(name.split()) for name in first[0][1]]
     twice = [name for name, count in Counter(header).items() if name and count > 1]
     if twice:
         raise ColumnsError(f'{path} has several columns {", ".join(twice)}: rename all but one')

@@ -225,6 +225,15 @@ def test_units_are_those_of_the_header(tmp_path):
     np.testing.assert_allclose(np.array(written[1:], float), [[270, 1250, 1], [135, 1000.5, 2]])
 
 
+def test_line_breaks_in_names_of_columns_are_blanks(tmp_path):
+    """As spreadsheets write a unit below a name; the column was not found."""
+    path = tmp_path / 'program.csv'
+    path.write_text(given := '"a\n[deg]",b\n90.0,0.5\n')
+    source = read_program(path, Chain('arm', 'standard', (Joint('a'), Joint('b', 'prismatic'))))
+    np.testing.assert_allclose(source.program.positions, [[np.pi / 2, 0.5]])
+    assert source.text_with(source.program) == given
+
+
 def test_signs_in_a_table_are_the_approach(tmp_path):
     path = tmp_path / 'program.csv'
     path.write_text('q1,q2,s1,s2\n1,2,-0.5,0\n3,4,1,7\n')
