@@ -22,7 +22,7 @@ from calib_ros.apply.program import Program, joint_values
 from calib_ros.errors import InputError
 from calib_ros.files.columns import Columns, check_quaternions, columns_of, with_rows
 from calib_ros.files.headers import name_and_unit, places
-from calib_ros.files.sheets import decimal_sign, text_and_separator
+from calib_ros.files.sheets import decimal_sign, refuse_short, text_and_separator
 from calib_ros.files.vocabulary import ANGLES, LENGTHS, POSE_COLUMNS, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -54,7 +54,10 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
 def _columns(path: Path) -> tuple[Columns, str, str]:
     """Return the columns of a table, the sign between its cells, and its text."""
     text, separator = text_and_separator(path)
-    return with_rows(columns_of(path, text.encode(), separator=separator), ()), separator, text
+    found = with_rows(columns_of(path, text.encode(), separator=separator), ())
+    if separator == ' ':
+        refuse_short(found, found.header[-1])
+    return found, separator, text
 
 
 def _with_decimals(found: Columns, names: Sequence[str]) -> Columns:

@@ -75,6 +75,7 @@ class _Content:
     notes: list[str]
     title: str = ''
     comments: Sequence[str] = ()
+    blanks: bool = False  # separate the cells
 
 
 def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence[str]) -> Sheet:
@@ -126,7 +127,7 @@ def _of_text(path: Path, layout: Layout) -> _Content:
     blocks = csv_blocks(path, narrow.encode(), separator)
     bare = ([(line, [*map(str.strip, cells)]) for line, cells in block] for block in blocks)
     rows = ([row for row in block if any(row[1])] for block in bare)
-    return _Content(rows, notes, comments=comments)
+    return _Content(rows, notes, comments=comments, blanks=separator == ' ')
 
 
 def _sheet(
@@ -162,6 +163,8 @@ def _sheet(
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
     if at >= 0 and max(used, default=0) < len(header):
         _refuse_shifted(columns, len(header))
+    if content.blanks:
+        refuse_short(columns, f'#{len(header)}')
     refuse_nominal(columns, [*above, *left])
     if left:
         without = lines_in_words([line for line, _ in left])
@@ -183,6 +186,17 @@ def _refuse_shifted(columns: Columns, width: int) -> None:
                 )
 
 
+def refuse_short(columns: Columns, last: str) -> None:
+    """Refuse a row between blanks without a cell in the last column, unless remarks are there."""
+    cells = columns.texts(last)
+    if '' in cells and all(_is_number(cell, ',') or cell.lower() in MISSING for cell in cells):
+        raise InputError(
+            f'{columns.path}, line {columns.lines[cells.index("")]}: fewer cells than its header '
+            'has names: between blanks no cell may be empty and no name in two words: write NaN '
+            'and Pose_name, or save it with commas or tabs'
+        )
+
+
 def text_and_separator(path: Path) -> tuple[str, str]:
     """Return the text of a table, and the sign between its cells."""
     text, _ = _text(path)
@@ -194,10 +208,11 @@ def text_and_separator(path: Path) -> tuple[str, str]:
 
 
 def _narrow(text: str, separator: str) -> str:
-    """Return a text with single blanks between cells that blanks separate."""
+    """Return a text with single blanks between cells that blanks separate, none before units."""
     if separator != ' ':
         return text
-    return re.sub(r'[ \t]+', ' ', re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text))
+    text = re.sub(r'[ \t]+', ' ', re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text))
+    return re.sub(r'(?<=\w) (?=[\[(](?:[^\W\d]{1,12}|[°º])[\])])', '', text)  # q1 [deg]
 
 
 def decimal_sign(cells: Iterable[str]) -> str:

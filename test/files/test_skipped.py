@@ -4,13 +4,14 @@
 
 import numpy as np
 import pytest
-from test_foreign import NAMES, PLAIN, assert_same, text_of
+from test_foreign import JOINTS, NAMES, PLACES, PLAIN, assert_same, text_of
 
 from calib_ros import Chain, Settings, read_table
 from calib_ros.errors import InputError
 from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout
+from calib_ros.files.programs import read_program
 from calib_ros.kinematics.chain import Joint
 
 ARM = Chain('arm', 'standard', (Joint('a'), Joint('b')))
@@ -227,6 +228,33 @@ def test_a_row_of_words_in_place_of_numbers_is_refused(tmp_path):
         path.write_text(f'{PLAIN}{row}\n')
         with pytest.raises(InputError, match=r'line 5: .* must be a finite number'):
             loading.table(path, ARM, Settings())
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'said'),
+    [
+        (' 0.25 ', '      ', 'line 3: fewer cells than its header'),
+        ('q1 ', 'the q1 ', 'line 2: fewer cells than its header'),
+        ('q1 q2 x', 'q1 (rad) q2 [rad] x', ''),
+        ('rms', 'note', 'line 4: fewer cells'),
+        (' 0.01\n', ' moved\n', ''),
+    ],
+)
+def test_between_blanks_no_cell_is_empty(tmp_path, old, new, said):
+    """The values behind an empty cell, or a name in two words, were read in other columns."""
+    path = tmp_path / 'cell.txt'
+    columns = [JOINTS, PLACES, np.full(3, 0.01)]
+    text = text_of(*columns, names=[*NAMES, 'rms'], separator=' ').replace(old, new)
+    if old in ('rms', ' 0.01\n'):  # the last cell
+        text = text.rstrip().rpartition(' ')[0] + '\n'
+    path.write_text(text)
+    if said:
+        with pytest.raises(InputError, match=said):
+            loading.table(path, ARM, Settings())
+        with pytest.raises(InputError, match=said):
+            read_program(path.rename(tmp_path / 'cell.csv'), ARM)
+    else:
+        assert_same(loading.table(path, ARM, Settings()), None)
 
 
 @pytest.mark.parametrize('cell', ['---', '***', '#VALUE!', '1.#QNAN', '-nan(ind)', 'lost', 'n.a.'])
