@@ -30,7 +30,7 @@ from calib_ros.estimation.levels import NEARER
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention
-from calib_ros.kinematics.chain_file import shipped_chains
+from calib_ros.kinematics.chain_file import shipped_chains, too_long
 from calib_ros.shown import counted
 
 Rescaled: TypeAlias = Callable[[float], DataChange]
@@ -341,10 +341,11 @@ def _of_signs(chain: Chain) -> Iterator[Suspect]:
 
 def _of_arms(chain: Chain) -> Iterator[Suspect]:
     """Yield lengths in mm, the other convention, wrong frames, and arms with like joints."""
-    mm = SCALES['mm']
-    small = [replace(j, a=mm * j.a, b=mm * j.b, d=mm * j.d) for j in chain.joints]
-    what, remedy = 'the lengths of the chain file are in mm, not metres', 'give metres there'
-    yield Suspect(what, remedy, chain=replace(chain, joints=tuple(small)), published=remedy)
+    if too_long(chain):  # a shorter one is of metres: any place fits a tiny arm to its size
+        mm = SCALES['mm']
+        small = [replace(j, a=mm * j.a, b=mm * j.b, d=mm * j.d) for j in chain.joints]
+        what, remedy = 'the lengths of the chain file are in mm, not metres', 'give metres there'
+        yield Suspect(what, remedy, chain=replace(chain, joints=tuple(small)), published=remedy)
     other: Convention = 'modified' if chain.convention == 'standard' else 'standard'
     what = f'the DH table is in the {other} convention, not the {chain.convention} one'
     remedy = f'convention: {other} in the chain file'

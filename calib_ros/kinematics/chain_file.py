@@ -84,15 +84,20 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
     return chain
 
 
+def too_long(chain: Chain) -> float:
+    """Return the length [m] of the links together if it is in mm: no arm is as long; else 0."""
+    along = sum(each.d for each in chain.joints)  # parallel axes share any d, with signs
+    length = sum(abs(each.a) for each in chain.joints) + abs(along)
+    return length if length > 100.0 else 0.0  # 0.1 m in mm: no arm is smaller
+
+
 def _refuse_other_units(chain: Chain, where: str) -> None:
     """Refuse limits in degrees and lengths in millimetres.
 
     Joint values in degrees would pass for radians between such limits, and plans and programs have
     no measured lengths to compare.
     """
-    along = sum(each.d for each in chain.joints)  # parallel axes share any d, with signs
-    length = sum(abs(each.a) for each in chain.joints) + abs(along)
-    if length > 100.0:  # 0.1 m in mm: no arm is smaller, and none as long
+    if length := too_long(chain):
         raise ConfigError(
             f'{where}: its links are {length:.0f} m long: lengths must be in metres, 300 mm as 0.3'
         )

@@ -41,7 +41,6 @@ RANKS = {
     'the device moves with linear_axis_joint': (1, ''),
     'elbow_joint is not given against shoulder_lift_joint: they are coupled': (2, 'elbow_joint'),
     'elbow_joint is in degrees, the other joints in radians': (2, 'elbow_joint'),
-    'the lengths of the chain file are in mm, not metres': (1, ''),
     'the DH table is in the modified convention, not the standard one': (3, ''),
     'the chain file gives a wrong base (fixed: true)': (3, ''),
     'the chain file gives a wrong tool (fixed: true)': (3, ''),
@@ -62,6 +61,7 @@ def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
     ends = [e.remedy for e in suspects(held, (seen,)) if 'leave this joint out' in e.remedy]
     assert [each.split()[-1] for each in ends] == ['q1=0', 'q7=0']  # of the seven columns
     assert 'the coordinates x, y, z of the positions are -x, -y, -z' not in found  # left-handed
+    assert 'the lengths of the chain file are in mm, not metres' not in found  # shorter than 0.1 m
     assert (
         'shoulder_pan_joint is not given against linear_axis_joint: they are coupled' not in found
     )
