@@ -6,8 +6,8 @@ If the nominal arm misses the measurements by more than faulty arms do, each sus
 undone, and base and tool are refitted in closed form (`start.py`); the best few are refined by
 least squares. Mistakes are named if undoing them reduces the typical error (distance plus angle
 times LEVER, of all but possible gross errors) below NEARER times the original and to that of a
-faulty arm. The zero of the first joint is a rotation of the base, that of the last joint one of
-the tool, so neither can be detected.
+faulty arm, or to a tenth: an arm may be worse than faulty ones. The zero of the first joint is a
+rotation of the base, that of the last joint one of the tool, so neither can be detected.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import norms
-from calib_ros.settings import LEVER
+from calib_ros.settings import EXCEPTION, LEVER
 from calib_ros.shown import rows_in_words
 
 
@@ -164,6 +164,7 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
         or _by_places(problem, chain, sets, given)
         or _in_some_rows(problem, chain, sets, given)
         or _several(problem, chain, given)
+        or _named(problem, chain, sets, given, inexact=True)
     )
     return found and _told(problem, replace(found, where=where + found.where))
 
@@ -214,10 +215,19 @@ def _of_images(problem: Problem) -> bool:
 
 
 def _named(
-    problem: Problem, chain: Chain, sets: Sets, given: Trial, of_rows: bool = False
+    problem: Problem,
+    chain: Chain,
+    sets: Sets,
+    given: Trial,
+    of_rows: bool = False,
+    inexact: bool = False,
 ) -> Explained | None:
-    """Return the mistakes that explain the sets best; only of what is written in each row."""
+    """Return the mistakes that explain the sets best; with `of_rows` those made in each row alone.
+
+    With `inexact` the arm may be worse than faulty ones, if a tenth of the error is left at most.
+    """
     rough, tried = [], []
+    most = EXCEPTION * min(given.share, 1.0) if inexact else 0.0
     of_images = _of_images(problem)
     likely = suspects(chain, given.sets, of_images)
     for each in (*likely, *in_any_order(chain, given.sets[0], of_images)):
@@ -232,7 +242,7 @@ def _named(
     for found, each in sorted(rough, key=lambda one: one[0].share)[:TRIED]:
         polished = refined(problem, found)
         # an arm in mm fits places in mm, and is off by metres
-        if polished.error <= largest_of(problem):
+        if polished.error <= largest_of(problem) or polished.share <= most:
             tried.append((polished, each))
     if not tried:
         return None
@@ -318,6 +328,8 @@ def _by_places(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Expl
     found = _named(problem, chain, alone, placed)
     if found is None or len(found.suspects) > 1:
         return None
+    if _named(problem, chain, sets, given, inexact=True):
+        return None  # with their orientations
     what = f'{found.suspects[0].what}, and the orientations do not fit either'
     return replace(found, suspects=(replace(found.suspects[0], what=what),))
 
