@@ -326,11 +326,11 @@ def _complete(
 def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:
     """Return the shortest t (3,) [m] that brings R_i t + b close to wanted (N, 3) [m].
 
-    Zero in directions in which rotations (N, 3, 3) hardly vary. b is arbitrary if `free`, else
-    zero.
+    Zero in directions in which rotations (N, 3, 3) vary little: well before a fit could take the
+    frame for degenerate and leave it where noise put it. b is arbitrary if `free`, else zero.
     """
     if free:
         turned, wanted = turned - turned.mean(axis=0), wanted - wanted.mean(axis=0)
     left, sizes, right = np.linalg.svd(turned.reshape(-1, 3), full_matrices=False)
-    known = sizes > DEGENERATE * np.sqrt(len(turned))
+    known = sizes > DEGENERATE / EXCEPTION * np.sqrt(len(turned))
     return np.asarray(right[known].T @ ((wanted.ravel() @ left)[known] / sizes[known]))

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, worst_prediction
+from fits import NOISE, SCARA, SIGMAS, UR10E, worst_prediction
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -220,6 +220,20 @@ def test_a_tool_that_is_given_stays_where_orientations_do_not_tell():
     np.testing.assert_allclose(_shortest(turned, wanted, True), [0.1, 0.2, 0.0], atol=1e-12)
     still = _shortest(turned, wanted - [1.0, 2.0, 3.0], False)
     np.testing.assert_allclose(still, [0.1, 0.2, 0.3], atol=1e-12)
+
+
+@pytest.mark.parametrize('seed', [9, 34])
+def test_axes_that_are_hardly_parallel_put_no_tool_metres_away(seed):
+    """A calibrated SCARA in new frames was 5 to 16 mm off: a fit found that direction unknown."""
+    rng = np.random.default_rng(seed)
+    tilts = rng.normal(scale=9e-4, size=len(SCARA.joints))
+    names = [f'{joint.name}.alpha' for joint in SCARA.joints]
+    chain = SCARA.with_offsets(dict(zip(names, tilts, strict=True)))
+    true = replace(chain, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.15))
+    seen = measure(true, chain.random_joints(30, rng), rng, *NOISE)
+    found = start_frames(Problem(chain, seen, **SIGMAS))
+    off = found.forward(seen.joints)[:, :3, 3] - seen.positions
+    assert norms(off).max() < 5e-4
 
 
 def test_distances_start_right_among_gross_errors_that_agree():
