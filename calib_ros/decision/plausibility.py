@@ -9,7 +9,7 @@ arm, not just a less accurate one, so the result is refused.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -202,8 +202,11 @@ def _order(problem: Problem) -> str:
 def _lag(problem: Problem, result: Identification) -> Identification:
     """Return the result with the lag that explains most of its residuals, refused if it harms."""
     known = {each.rule for each in result.refusals} & {Rule.MISTAKE, Rule.ENCODER, Rule.MOVED}
-    stands = all(each.velocity is None and each.pixels is None for each in problem.sets)
-    if result.noise.position <= 1.0 or known or not stands:
+    if result.noise.position <= 1.0 or known:
+        return result
+    if any(each.velocity is not None for each in problem.sets):
+        return _uneven(problem, result)
+    if any(each.pixels is not None for each in problem.sets):
         return result
     first, *more = map(_with_moves, problem.sets)
     bases = sorted({each.base for each in problem.sets})
@@ -229,6 +232,39 @@ def _lag(problem: Problem, result: Identification) -> Identification:
         'time until measurements rest, and stop for longer'
     )
     if _imitated(late, result):
+        return replace(result, refusals=(Reason(Rule.LAG, text), *result.refusals))
+    return replace(result, remarks=(*result.remarks, text))
+
+
+def _uneven(problem: Problem, result: Identification) -> Identification:
+    """Return the result with joints that are late in motion, each in its way, refused if it harms.
+
+    Delays are play with the speed for its sign; where true play explains more, it is that.
+    """
+    joints = effects.members(result.chain, 'backlash')
+    if set(joints) & set(result.names):
+        return result
+
+    def moving(rate: Callable[[FloatArray], FloatArray]) -> Problem:
+        first, *more = (
+            replace(s, approach=None if s.velocity is None else rate(s.velocity))
+            for s in problem.sets
+        )
+        return replace(problem, observations=first, more=more)
+
+    def share(at: Problem, names: Sequence[str]) -> float:
+        return explained_share(at, result.chain.with_effects(names), result.names, names)
+
+    late = moving(np.positive)
+    explained = share(late, joints)
+    if explained < EXPLAINED or explained < share(moving(np.sign), joints):
+        return result
+    most = Parameter(max(joints, key=lambda name: share(late, [name]))).owner
+    text = (
+        f'joints late by different times explain {100.0 * explained:.0f} % of the residuals, '
+        f'above all {most}: read all joints at one moment, or stop at each pose (mode dwell)'
+    )
+    if _imitated(replace(late, effects=(*problem.effects, *joints)), result):
         return replace(result, refusals=(Reason(Rule.LAG, text), *result.refusals))
     return replace(result, remarks=(*result.remarks, text))
 
