@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from calib_ros.decision.suspects import FIRST, ORIENTATIONS, hidden, suspects
 from calib_ros.decision.trials import (
     Trial,
     among,
+    as_poses,
     fits_each_side,
     in_frames,
     largest_of,
@@ -48,14 +49,14 @@ from calib_ros.estimation.levels import (
 )
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.resection import board_poses
 from calib_ros.estimation.start import flange
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import norms
 from calib_ros.settings import EXCEPTION, LEVER
 from calib_ros.shown import rows_in_words
+
+Tries: TypeAlias = Sequence[tuple[Trial, Suspect]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +140,7 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
     With `far` only if the arm as given, in its best frames, is further off than faulty arms.
     """
     sets = tuple(
-        _as_poses(problem, each)
+        as_poses(problem, each)
         for each in problem.sets
         if each.distances is None and _of_images(problem) == (each.pixels is not None)
     )
@@ -156,16 +157,18 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
     if given is None or (far and given.error <= largest_of(problem)):
         return None
     missing = None if _of_images(problem) else dead(chain, given.sets)
-    found = (
-        (missing and Explained((missing,), given.error, np.nan))  # no change restores it
-        or _of_a_lost_row(problem, chain, sets, given)
-        or _named(problem, chain, sets, given)
-        or _of_repeats(problem, given.chain, _moved(problem, sets[0], 0))
-        or _by_places(problem, chain, sets, given)
-        or _in_some_rows(problem, chain, sets, given)
-        or _several(problem, chain, given)
-        or _named(problem, chain, sets, given, inexact=True)
-    )
+    found = missing and Explained((missing,), given.error, np.nan)  # no change restores it
+    found = found or _of_a_lost_row(problem, chain, sets, given)
+    if not found:
+        tried = _tried(problem, chain, sets, given)
+        found = (
+            _named(problem, given, tried)
+            or _of_repeats(problem, given.chain, _moved(problem, sets[0], 0))
+            or _by_places(problem, chain, sets, given, tried)
+            or _in_some_rows(problem, chain, sets, given)
+            or _several(problem, chain, given)
+            or _named(problem, given, tried, inexact=True)
+        )
     return found and _told(problem, replace(found, where=where + found.where))
 
 
@@ -199,7 +202,7 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | 
         chain = chain.with_frame(name, replace(chain.frame(name), fixed=True))
     if (given := trial_of(chain, (seen.select(rows).spread(),))) is None:
         return None
-    found = _named(problem, chain, given.sets, given, of_rows=True)
+    found = _named(problem, given, _tried(problem, chain, given.sets, given, of_rows=True))
     if found is None or len(rows) == len(seen):
         return found
     poses = rows_in_words(rows.tolist(), seen.stamps_ns, problem.of_messages)
@@ -214,21 +217,14 @@ def _of_images(problem: Problem) -> bool:
     return any(each.pixels is not None for each in problem.sets)
 
 
-def _named(
-    problem: Problem,
-    chain: Chain,
-    sets: Sets,
-    given: Trial,
-    of_rows: bool = False,
-    inexact: bool = False,
-) -> Explained | None:
-    """Return the mistakes that explain the sets best; with `of_rows` those made in each row alone.
+def _tried(
+    problem: Problem, chain: Chain, sets: Sets, given: Trial, of_rows: bool = False
+) -> Tries:
+    """Return the arm with the mistakes undone that explain most, the best first.
 
-    With `inexact` the arm may be worse than faulty ones, if a tenth of the error is left at most.
+    With `of_rows` only mistakes made in each row alone.
     """
-    rough, tried = [], []
-    most = EXCEPTION * min(given.share, 1.0) if inexact else 0.0
-    of_images = _of_images(problem)
+    rough, of_images = [], _of_images(problem)
     likely = suspects(chain, given.sets, of_images)
     for each in (*likely, *in_any_order(chain, given.sets[0], of_images)):
         if of_rows and not each.changes:
@@ -239,21 +235,30 @@ def _named(
         found = trial_of(each.chain or chain, each.undone(few))
         if found is not None and found.share < given.share:
             rough.append((found, each))
-    for found, each in sorted(rough, key=lambda one: one[0].share)[:TRIED]:
-        polished = refined(problem, found)
-        # an arm in mm fits places in mm, and is off by metres
-        if polished.error <= largest_of(problem) or polished.share <= most:
-            tried.append((polished, each))
-    if not tried:
+    best = sorted(rough, key=lambda one: one[0].share)[:TRIED]
+    tried = [(refined(problem, found), each) for found, each in best]
+    return sorted(tried, key=lambda one: one[0].share)
+
+
+def _named(
+    problem: Problem, given: Trial, tried: Tries, inexact: bool = False
+) -> Explained | None:
+    """Return the mistakes that explain the measurements best.
+
+    With `inexact` the arm may be worse than faulty ones, if a tenth of the error is left at most.
+    """
+    most = EXCEPTION * min(given.share, 1.0) if inexact else 0.0
+    # an arm in mm fits places in mm, and is off by metres
+    good = [x for x in tried if x[0].error <= largest_of(problem) or x[0].share <= most]
+    if not good:
         return None
-    tried.sort(key=lambda one: one[0].share)
-    best, least = tried[0][0], tried[0][0].share
+    best, least = good[0][0], good[0][0].share
     if best.error > NEARER * given.error or least > NEARER * min(given.share, 1.0):
         return None
-    named = [each for one, each in tried if one.share <= ALIKE * least]
+    named = [each for one, each in good if one.share <= ALIKE * least]
     lowest = min(each.rank for each in named)
     named = [each for each in named if each.rank == lowest]
-    named += [each for one, each in tried if ALIKE * least < one.share <= least / NEARER]
+    named += [each for one, each in good if ALIKE * least < one.share <= least / NEARER]
     unlike = {(each.what, each.remedy): each for each in named}
     return Explained(tuple(unlike.values())[:SEVERAL], given.error, best.error)
 
@@ -312,7 +317,9 @@ def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> E
     return Explained((two,), given.error, np.nan)
 
 
-def _by_places(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:
+def _by_places(
+    problem: Problem, chain: Chain, sets: Sets, given: Trial, tried: Tries
+) -> Explained | None:
     """Return that the orientations are wrong, if the positions are explained."""
     whole = all(each.oriented.all() and not (each.socket or each.inverse) for each in sets)
     if _of_images(problem) or not whole:
@@ -325,11 +332,11 @@ def _by_places(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Expl
         known = placed.error + LEVER * problem.sigma_orientation
         enough = known < NEARER * given.error
         return Explained((ORIENTATIONS,), given.error, placed.error) if enough else None
-    found = _named(problem, chain, alone, placed)
+    if _named(problem, given, tried, inexact=True):
+        return None  # with their orientations
+    found = _named(problem, placed, _tried(problem, chain, alone, placed))
     if found is None or len(found.suspects) > 1:
         return None
-    if _named(problem, chain, sets, given, inexact=True):
-        return None  # with their orientations
     what = f'{found.suspects[0].what}, and the orientations do not fit either'
     return replace(found, suspects=(replace(found.suspects[0], what=what),))
 
@@ -378,17 +385,10 @@ def _together(mistakes: Sequence[Suspect]) -> Suspect:
     return Suspect(what, '; '.join(of_tables), published='; '.join(published))
 
 
-def _as_poses(problem: Problem, each: Observations) -> Observations:
-    """Return the measurements, boards in images as poses."""
-    if each.pixels is None:
-        return each
-    return board_poses(each, require_lens(problem.chain.frame(each.camera).lens, each.camera))
-
-
 def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
     """Return measurements with the joint values `rows` below, held-out rows included."""
     same = [e for e in problem.judging if (e.base, e.tool) == (each.base, each.tool)]
-    parts = [each, *(_as_poses(problem, e) for e in same if e.distances is None)]
+    parts = [each, *(as_poses(problem, e) for e in same if e.distances is None)]
     order = np.argsort(np.concatenate([e.stamps_ns for e in parts]), kind='stable')
     measured, reported = (slice(max(0, n), min(0, n) or None) for n in (-rows, rows))
     joined: dict[str, Any] = {}

@@ -16,10 +16,12 @@ from calib_ros.estimation.leastsquares import System, factor_of, minimise
 from calib_ros.estimation.levels import CLEARLY, MOST_OUTLIERS
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.resection import board_poses
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.start import closed_forms, flange, movable
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.settings import LEVER
@@ -81,6 +83,13 @@ def _usual(sizes: FloatArray) -> float:
     """Return the size that a usual share of (N,) is within; np.quantile is slow."""
     last = int((1.0 - MOST_OUTLIERS) * (len(sizes) - 1))
     return float(np.partition(sizes, last)[last])
+
+
+def as_poses(problem: Problem, each: Observations) -> Observations:
+    """Return the measurements, boards in images as poses."""
+    if each.pixels is None:
+        return each
+    return board_poses(each, require_lens(problem.chain.frame(each.camera).lens, each.camera))
 
 
 def in_frames(problem: Problem, chain: Chain, sets: Sets) -> Trial | None:

@@ -60,8 +60,9 @@ def test_two_changed_zeros_are_told_by_name(earlier, joints):
     assert all('all joints' not in each for each in told)
 
 
-@pytest.mark.parametrize('turn', [-3.6, 7.2])
-@pytest.mark.parametrize('joint', UR10E.joint_names[:5])
+@pytest.mark.parametrize(
+    ('joint', 'turn'), zip(UR10E.joint_names[:5], (-3.6, 7.2, -3.6, 7.2, -3.6), strict=True)
+)
 def test_a_zero_that_is_off_by_a_turn_of_the_motor_is_the_only_change(earlier, joint, turn):
     """It is far larger than usual changes: other joints, or the whole link, shared it."""
     true, previous, oriented = earlier
