@@ -24,6 +24,7 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.qos import qos_profile_services_default
 from rclpy.serialization import deserialize_message
+from scipy.spatial import cKDTree
 from sensor_msgs.msg import JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory
 
@@ -140,8 +141,7 @@ class Guide:
         candidates = self._candidates
         if candidates is None:
             candidates = draw_candidates(design, SOME_POSES, rng)
-        apart = np.abs(candidates[:, np.newaxis] - taken).max(axis=2).min(axis=1)
-        candidates = candidates[apart > STILL]
+        candidates = _untaken(candidates, taken)
         if len(candidates):
             best = candidates[choose(design, candidates, 1)[0]]
             self._next_pose.publish(to_ros.joints(self._session.joint_names, best, self._now()))
@@ -201,6 +201,12 @@ class Guide:
 
     def _now(self) -> Any:
         return self._node.get_clock().now().to_msg()
+
+
+def _untaken(candidates: FloatArray, taken: FloatArray) -> FloatArray:
+    """Return the candidates (M, n) that are none of the poses taken (N, n)."""
+    far, _ = cKDTree(taken).query(candidates, p=np.inf, distance_upper_bound=STILL)
+    return np.asarray(candidates[np.isinf(far)])
 
 
 @lru_cache(maxsize=1)
