@@ -98,6 +98,7 @@ def start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         package, _, executable = given['tracker'].partition('/')
         if not executable:
             raise ConfigError(f'tracker must be PACKAGE/EXECUTABLE, not "{given["tracker"]}"')
+        given['measured_pose'] = measured_pose  # refused if it would not be heard
         started.append(
             Node(
                 package=package,

@@ -146,7 +146,18 @@ def ros_arguments(given: Mapping[str, str]) -> list[str]:
     for topic in REMAPPED:
         if given.get(topic):
             words += ['-r', f'{topic}:={given[topic]}']
+    _refuse_unheard(given.get('measured_pose', ''), given.get('sources', ''))
     return words
+
+
+def _refuse_unheard(poses: str, sources: str) -> None:
+    listed = _value(PARAMETERS['sources'], sources)
+    names = {word.strip('/') for each in listed for word in each.split()[:1]}
+    if poses and names and names.isdisjoint(('measured_pose', poses.strip('/'))):
+        raise ConfigError(
+            f'measured_pose:={poses} would not be heard, since sources names other topics only: '
+            'name it there too'
+        )
 
 
 def node_options(given: Mapping[str, str]) -> dict[str, Any]:
@@ -244,6 +255,13 @@ def _described(parameter: NodeParameter) -> str:
 
 
 def _as_yaml(parameter: NodeParameter, text: str) -> str:
+    value = _value(parameter, text)
+    if isinstance(value, tuple):
+        return f'[{", ".join(map(_quoted, value))}]'
+    return _quoted(value) if isinstance(value, str) else str(value).lower()
+
+
+def _value(parameter: NodeParameter, text: str) -> Any:
     import yaml
 
     given: object = text
@@ -251,10 +269,7 @@ def _as_yaml(parameter: NodeParameter, text: str) -> str:
         loaded = yaml.safe_load(text)
         given = loaded if isinstance(loaded, bool | list) else text
     given = text if isinstance(parameter.default, str) else given
-    value = parse_like(parameter.default, given, f'launch argument "{parameter.name}"')
-    if isinstance(value, tuple):
-        return f'[{", ".join(map(_quoted, value))}]'
-    return _quoted(value) if isinstance(value, str) else str(value).lower()
+    return parse_like(parameter.default, given, f'launch argument "{parameter.name}"')
 
 
 def _quoted(text: str) -> str:

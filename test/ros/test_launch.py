@@ -54,7 +54,7 @@ TYPED = {
 
 
 def test_every_type_arrives(launched):
-    topics = {'joint_states': '/ur/joint_states', 'measured_pose': 'tracker/pose'}
+    topics = {'joint_states': '/ur/joint_states', 'measured_pose': 'left'}
     given = {name: text for name, (text, _) in TYPED.items()}
     (node,), _ = launched('calibration.launch.py', **given, **topics, namespace='cell_1')
     words = node.kwargs['ros_arguments']
@@ -110,3 +110,14 @@ def test_launch_commands_in_the_documents_are_valid(name):
 def test_arguments_of_another_launch_file_that_includes_ours_are_its_own():
     command = ['ros2', 'launch', 'my_cell', 'all.launch.py', 'gripper:=true']
     refuse_unknown(command, 'calibration.launch.py', ['chain'])
+
+
+@pytest.mark.parametrize('sources', ['/wire type=Range', "['/wire type=Range', '/b device=b']"])
+def test_a_topic_that_other_sources_replace_is_refused(launched, sources):
+    """It was remapped, and nothing heard it."""
+    given = {'chain': 'ur10e', 'measured_pose': '/tracker/pose'}
+    with pytest.raises(ConfigError, match='measured_pose:=/tracker/pose would not be heard'):
+        launched('calibration.launch.py', sources=sources, **given)
+    for name in ('/tracker/pose device=tracker', 'measured_pose device=tracker'):
+        (node,), _ = launched('calibration.launch.py', sources=f"['/wire', '{name}']", **given)
+        assert 'measured_pose:=/tracker/pose' in node.kwargs['ros_arguments']

@@ -61,6 +61,14 @@ def test_a_driver_needs_its_package(launched):
         launched('cell.launch.py', chain='ur10e', tracker='driver')
 
 
+def test_a_driver_that_no_source_hears_is_refused(launched):
+    given = {'chain': 'ur10e', 'tracker': 'vicon/driver', **QUIET}
+    with pytest.raises(ConfigError, match='measured_pose would not be heard'):
+        launched('cell.launch.py', sources='/wire type=Range', **given)
+    actions, _ = launched('cell.launch.py', sources='measured_pose device=vicon', **given)
+    assert set(nodes(actions)) == {'calibration_node', 'driver'}
+
+
 def test_the_chain_of_a_parameter_file_holds_beside_a_urdf(launched, tmp_path):
     urdf, path = tmp_path / 'robot.urdf', tmp_path / 'node.yaml'
     urdf.write_text('<robot name="arm"/>')
