@@ -10,12 +10,12 @@ files and node share one list.
 from __future__ import annotations
 
 import argparse
+import re
 import textwrap
 from ast import literal_eval
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
-from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -197,10 +197,14 @@ def refuse_ignored_files(command: Sequence[str], node: str) -> None:
             name = f'{above}/{key.strip("/")}'
             yield from nodes(below, name) if 'ros__parameters' not in below else (name,)
 
+    def applies(key: str) -> bool:  # * is one name, /** any number of them
+        names = re.escape(key).replace(r'/\*\*', r'(/\w+)*').replace(r'\*', r'\w+')
+        return bool(re.fullmatch(names, node))
+
     paths = [path for flag, path in pairwise(command) if flag == '--params-file']
     found = (yaml.safe_load(Path(path).read_bytes()) or {} for path in paths)
     keys = [key for each in found for key in nodes(each, '')]
-    if keys and not any(fnmatchcase(node, key.replace('/**', '*')) for key in keys):
+    if keys and not any(map(applies, keys)):
         raise ConfigError(
             f'{" and ".join(paths)} has no parameters of {node}, but of {", ".join(some(keys))}: '
             'use the key /**, which matches every node'

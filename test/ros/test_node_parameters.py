@@ -219,6 +219,10 @@ def test_a_serial_number_is_text(word, meant):
         (['/**'], True),
         (['/**/calibration_node'], True),
         (['/cell_1/*'], True),
+        (['/*/calibration_node'], True),
+        (['/**/cell_1/**'], True),
+        (['/*'], False),  # of nodes without a namespace
+        (['*', '/*/*/calibration_node'], False),
     ],
 )
 def test_a_parameter_file_of_other_nodes_is_refused(tmp_path, keys, applies):
