@@ -111,6 +111,7 @@ class FrameNames:
     def __init__(self, wanted: str = '') -> None:
         self.wanted = wanted
         self._known: dict[str, Counter[str]] = {}
+        self._told: set[str] = set()  # frames that are not wanted, up to MOST_NAMES
         self.usual: dict[str, str] = {}
         """The usual frames of devices with more than a few measurements."""
 
@@ -130,7 +131,10 @@ class FrameNames:
         """
         wanted = self.required(device)
         if wanted and frame_id != wanted:
-            return f'in frame "{frame_id}", not in frame_id "{wanted}"'
+            if len(self._told) < MOST_NAMES:
+                self._told.add(frame_id)
+            told = frame_id if frame_id in self._told else '...'
+            return f'in frame "{told}", not in frame_id "{wanted}"'
         if not frame_id.isprintable():  # it is written to tables
             return 'in a frame whose name cannot be printed'
         if not self.note(device, frame_id, count):

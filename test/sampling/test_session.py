@@ -244,6 +244,19 @@ def test_frames_without_end_are_not_remembered():
     assert dropped['measurements: in one of more than 50 frames'] == 9
 
 
+def test_frames_without_end_are_not_told_each():
+    """With frame_id each of them was a cause of its own, in the diagnostics of each second."""
+    made = CalibrationSession(UR5E, Settings(frame_id='cell'))
+    for k in range(60):
+        message = pose(k + 1, np.zeros(3), np.eye(3))
+        message.header.frame_id = f'frame {k}'
+        take(made, (TRACKER, POSE, message))
+    dropped = made.account().dropped
+    assert dropped['measurements: in frame "frame 49", not in frame_id "cell"'] == 1
+    assert dropped['measurements: in frame "...", not in frame_id "cell"'] == 10
+    assert len(dropped) == 51
+
+
 def test_samples_of_another_robot_are_not_restored():
     made = session(samples())
     with pytest.raises(InputError, match='have 7 joint values, chain "ur5e" has 6 joints'):
