@@ -157,8 +157,8 @@ class FrameNames:
     def main(self, device: str) -> str | None:
         """Return the required or usual frame of a device, or the most frequent one so far."""
         known = self._known.get(device)
-        found = self.required(device) or self.usual.get(device)
-        return found or (max(known, key=known.__getitem__) if known else None)
+        most = max(known, key=known.__getitem__) if known else None
+        return self.required(device) or self.usual.get(device, most)
 
     @property
     def different(self) -> tuple[str, ...]:
@@ -167,9 +167,9 @@ class FrameNames:
         That is the required one, as soon as any are in it.
         """
         for device, known in self._known.items():
-            few = known.total() - max(known.values()) <= EXCEPTION * known.total()
-            required = self.required(device)
-            if required not in known if required else not few:
+            required, own = self.required(device), self.main(device)
+            many = known.total() - known[own or ''] > EXCEPTION * known.total()
+            if required not in known if required else many:
                 return tuple(sorted(known))
         return ()
 

@@ -16,6 +16,7 @@ from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import verdict
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.slices import NO_ACCIDENT
 from calib_ros.sampling.sources import Source
 from calib_ros.settings import Settings
 
@@ -131,6 +132,21 @@ def test_a_sample_in_a_stray_frame_is_left_out_when_the_usual_one_is_known():
     assert len(made.problem().observations) == 29
     assert made.account().notes == {LEFT_OUT: 1}
     assert made.identify().accepted
+
+
+@pytest.mark.parametrize('first', ['odom', ''])
+def test_a_device_that_renames_its_frame_is_told(first):
+    """As a driver once it has started: the few poses before that were identified unasked."""
+    made = CalibrationSession(UR5E)
+    drive(made, 16, [renamed(tracker(), dict.fromkeys(range(NO_ACCIDENT), first))])
+    dropped = made.account().dropped
+    cause = f'measurements: in frame "tracker", not in "{first}" like the others'
+    assert dropped[cause] > made.account().poses // 2
+    said = f'different frames ({first or "one without name"}, tracker): set frame_id'
+    assert said in made.status()
+    with pytest.raises(InputError, match=r'different frames .*: set frame_id'):
+        made.problem()
+    assert {sample.frame_id for sample in made.usable} == {first}
 
 
 def test_poses_of_another_frame_can_be_removed():
