@@ -45,7 +45,7 @@ PAGES = ('report.html', 'report.md', 'residuals.csv', 'before_after.png')
 RESULT_FILES = ('calibration.yaml', 'result.json', 'settings.yaml', *PAGES)
 REPORTS = (*PAGES, 'report.pdf')
 UNCHANGED = f'{reports.NOT_YET}: {reports.BRING}'
-NOT_OF_UPDATES = ('history', 'tolerance', 'pdf', 'model', 'fixed', 'priors')
+NOT_OF_UPDATES = ('history', 'tolerance', 'pdf', 'model', 'fixed', 'priors', 'folds')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -84,6 +84,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
     with common.output_files(options, ('calibration.yaml', 'result.json', *REPORTS)) as contents:
         loaded, _ = _loaded(options, screen)
+        if loaded.refusals:
+            raise InputError('; '.join(loaded.refusals))
         common.at_least(options, growth=0)
         previous = inputs.calibration_of(
             options.previous, 'identify --previous', loaded.problem.chain

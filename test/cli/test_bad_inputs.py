@@ -50,7 +50,7 @@ def bad_inputs():
     yield 'a cone to nothing', ('plan', '--chain', 'ur5e', '--cone', '30'), 'needs --tracker'
     nothing = ('workspace', 'r', '--chain', 'ur5e', '--out', 'map', '--aim', 'worst')
     yield 'nothing to place', nothing, '--aim needs --task or --joint-box'
-    for useless in (('--history', 'h'), ('--model', 'auto')):
+    for useless in (('--history', 'h'), ('--model', 'auto'), ('--folds', '3')):
         given = (*good, *useless, '--previous', 'r')
         yield f'useless {useless[0]}', given, f'{useless[0]} does not apply to --previous'
     for useless in (('--delay', '0.1'), ('--mode', 'continuous'), ('--largest-loss', '1')):

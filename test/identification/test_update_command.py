@@ -61,6 +61,21 @@ def test_the_command_writes_the_calibration_brought_up_to_date(earlier, run, tmp
     assert not (tmp_path / 'again' / 'calibration.yaml').exists()
 
 
+def test_a_bag_with_too_much_lost_updates_nothing(earlier, run, tmp_path):
+    """As it gives no calibration: what is missing may be the poses that matter."""
+    true, previous = earlier
+    (tmp_path / 'earlier.yaml').write_text(previous.dump())
+    write_csv(tmp_path / 'few.csv', rows_of(problem(true, 20, 1).observations, 0))
+    assert run('csv2bag', 'few.csv', 'bag', '--chain', 'ur10e')[0] == 0
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
+    file.write_bytes(file.read_bytes()[: int(0.6 * file.stat().st_size)])
+    given = ('identify', 'bag', '--chain', 'ur10e', '--sigma-position', '5e-5')
+    given += ('--sigma-orientation', '2e-4', '--previous', 'earlier.yaml')
+    status, _, told = run(*given)
+    assert (status, 'of the messages could not be read: accept the rest with' in told) == (1, True)
+    assert run(*given, '--largest-loss', '0.5')[0] == 0
+
+
 def test_no_report_of_the_earlier_calibration_stays_beside_its_update(earlier, run, tmp_path):
     true, previous = earlier
     (tmp_path / 'out').mkdir()
