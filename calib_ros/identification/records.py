@@ -123,7 +123,8 @@ class Record:
         known, where = self._part('nominal'), self.where
         if known.get('convention') != chain.convention:
             raise ConfigError(
-                f'{where} does not contain its nominal chain: give that with --chain'
+                f'{where} does not contain its nominal chain: give the calibration.yaml written '
+                'by calib_ros identify or, where a command takes it, that chain (--chain)'
             )
         rows = self._rows(chain)
         joints = tuple(replace(joint, **rows[joint.name]) for joint in chain.joints)

@@ -8,7 +8,7 @@ import shutil
 import pytest
 from measured import TRAIN, measured, rows_of, write_csv
 
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.chain_file import dump_chain, load_chain
 
 
 def bad_inputs():
@@ -87,6 +87,7 @@ def bad_inputs():
         'refused was not accepted',
     )
     yield 'a folder as calibration', ('compare', 'folder', 'none'), 'folder holds no calibration.y'
+    yield 'a record of its own', ('compare', 'own.yaml', 'none'), 'by calib_ros identify or, where'
     yield 'a table as calibration', ('compare', 'good.csv', 'none'), 'is a table, but compare'
     yield 'a picture as chain', (*chain_of, 'shot.png'), 'shot.png is no chain file'
     yield (
@@ -126,6 +127,7 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     (tmp_path / 'link.csv').symlink_to('gone.csv')
     (tmp_path / 'empty').write_text('')
     (tmp_path / 'broken.yaml').write_text('joints: [\n')
+    (tmp_path / 'own.yaml').write_text(dump_chain(load_chain('ur5e'), {'source': 'x'}))
     (tmp_path / 'move.dat').write_text('&ACCESS RVP\nDEFDAT MOVE\nENDDAT\n')
     (tmp_path / 'part.dat').write_text('DEFDAT MOVE\nDECL E6AXIS XP1={A1 1.0,A2 2.0}\nENDDAT\n')
     (tmp_path / 'start.dtx').write_text('<?xml version="1.0"?><Database/>')
