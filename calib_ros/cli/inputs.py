@@ -104,7 +104,8 @@ def origin_of(
 ) -> page.Origin:
     """Return the origin of a result: the options, and the files read."""
     chain = Path(options.chain)
-    known = (*inputs, chain if chain.is_file() else None)
+    beside = (vars(options).get(name) for name in ('joints', 'places', 'board', 'intrinsics'))
+    known = (*inputs, *beside, chain if chain.is_file() else None)
     people = {name: getattr(options, name, '') for name in OF_REPORTS}
     return page.Origin(rows.inputs_of(*known), settings=settings, command=options.typed, **people)
 

@@ -56,6 +56,9 @@ def test_a_result_counts_images_and_corners(identified):
         assert text in page.text
     assert page.data['explorer']['images'][24] == '1.png'
     assert page.data['explorer']['things'] == 'corners'
+    document = json.loads((out / 'result.json').read_text())
+    read = {each['name'] for each in document['origin']['inputs']}
+    assert read == {'corners.csv', 'board.yaml', 'places.csv', 'camera.yaml'}
 
 
 def test_a_slip_is_told_by_its_image_and_line(identified):
