@@ -180,13 +180,16 @@ def _tail(a: float, alpha: float, beta: float, b: float) -> FloatArray:
 def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> str:
     """Return the pose of each joint in the frame of the one before, as vendors write it.
 
-    The first is in the base, the last is the flange. Joints move about, or along, their z.
+    The first is in the base, the last is the flange. Joints turn about their z, those listed as
+    prismatic move along it.
     """
     form = converted(replace(chain, base=Frame(), tool=Frame()), 'modified')
     names = (*chain.joint_names, 'flange')
     poses = {name: xyz_rpy(place) for name, place in zip(names, origins(form), strict=True)}
     signs = {joint.name: joint.sign for joint in form.joints}
     document: dict[str, Any] = {'kinematics': poses, 'signs': signs}
+    if slides := [joint.name for joint in form.joints if joint.type == 'prismatic']:
+        document['prismatic'] = slides
     digest = hashlib.sha256(dump_yaml(document).encode()).hexdigest()
     document['hash'] = f'sha256_{digest}'
     if origin:
@@ -207,7 +210,7 @@ def forward_of(text: str, chain: Chain, q: FloatArray) -> FloatArray:
     document = parse_yaml(text, 'kinematics.yaml')
     poses, signs = document['kinematics'], document['signs']
     places = [pose_matrix(poses[name]) for name in chain.joint_names]
-    slides = [joint.type == 'prismatic' for joint in chain.joints]
+    slides = [name in document.get('prismatic', ()) for name in chain.joint_names]
     values = chain.effective(q.T).T
     moved = walked(places, values * [signs[name] for name in chain.joint_names], slides)
     end = pose_matrix(poses['flange']) @ chain.frame('tool').matrix

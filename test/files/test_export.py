@@ -196,6 +196,14 @@ def test_a_table_says_what_its_rows_cut_off(name):
     np.testing.assert_allclose(reached, chain.forward(q), rtol=0, atol=1e-8)
 
 
+def test_kinematics_tell_which_joints_slide():
+    """Nothing else in the file did."""
+    assert yaml.safe_load(kinematics_yaml(scara()))['prismatic'] == ['j3']
+    assert 'prismatic' not in yaml.safe_load(kinematics_yaml(load_chain('ur5e')))
+    by_name = {each.name: each for each in exports(scara(), scara())}
+    assert yaml.safe_load(by_name['kinematics.yaml'].content)['prismatic'] == ['j3']
+
+
 def test_kinematics_tell_a_changed_robot_by_their_hash():
     _, chain = corrected('ur5e')
     first = yaml.safe_load(kinematics_yaml(chain))
