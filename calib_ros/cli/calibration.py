@@ -97,9 +97,9 @@ def _export(options: argparse.Namespace, screen: Screen) -> int:
     with common.output_files(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as contents:
         contents |= {each.name: each.content for each in found}
     for each in found:
-        exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'
+        off = f'up to {1e3 * each.error:.3f} mm off{each.elsewhere}' if each.error else 'exact'
         beyond = f' with what its first line says, {each.beyond}' if each.beyond else ''
-        screen.say(f'{options.out / each.name}: {exact}{beyond}')
+        screen.say(f'{options.out / each.name}: {off}{beyond}')
     known = dict(nominal.effects)
     if lost := [name for name, value in chain.effects if value != known.get(name, 0.0)]:
         held = ' --fixed "*.coupling_*"' if any('.coupling_' in name for name in known) else ''

@@ -71,6 +71,7 @@ class Export:
     content: str
     error: float  # largest position error [m]
     beyond: str = ''  # poses before and after the rows, as text
+    elsewhere: str = ''  # where that is, and the error over the joint range, as text
 
 
 def exports(
@@ -115,9 +116,12 @@ def exports(
         ('joint_offsets.csv', ('zero',), 'nominal table with corrected joint offsets only'),
     ):
         best = _approximated(chain, nominal, kinds, region)
-        error = distance(best, chain, region)
-        text = head(chain, f'{nominal.convention} {what}{of_table}', error)
-        found.append(Export(name, text + _csv(best), error))
+        error, elsewhere = distance(best, chain, region), ''
+        if joints is not None:
+            most = 1e3 * distance(best, chain, q)
+            elsewhere = f' at the measured joint values, {most:.3f} mm over the joint range'
+        text = head(chain, f'{nominal.convention} {what}{of_table}', error, elsewhere)
+        found.append(Export(name, text + _csv(best), error, elsewhere=elsewhere))
     return tuple(found)
 
 
@@ -250,10 +254,10 @@ def pose_matrix(pose: Mapping[str, float]) -> FloatArray:
     return se3.transform(rotation.as_matrix(), np.array([pose[k] for k in 'xyz']))
 
 
-def head(chain: Chain, what: str, error: float) -> str:
+def head(chain: Chain, what: str, error: float, elsewhere: str = '') -> str:
     """Return the first line: a file's kind, its error [m], and the table of the chain."""
     name = re.sub(r'[^\w .-]', '_', chain.name)  # one line, one cell
-    exact = 'exact' if error == 0.0 else f'up to {1e3 * error:.3f} mm off the calibrated arm'
+    exact = f'up to {1e3 * error:.3f} mm off the calibrated arm{elsewhere}' if error else 'exact'
     table = f'calibrated table {table_hash(chain)}'
     return f'# {name}: {what}; metres and radians; {exact}; {table}\n'
 

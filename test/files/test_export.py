@@ -300,6 +300,10 @@ def test_the_command_line_fits_tables_to_the_measured_region(files, tmp_path):
 
     near = files('--measured', 'measured.csv')
     assert error(near) < 0.5 * error(files())
+    first = near['dh_without_beta.csv'].partition('\n')[0]
+    more = re.search('arm at the measured joint values, (.*) mm over the joint range;', first)
+    assert float(more.group(1)) > error(files())
+    assert 'over the joint range' not in files()['dh_without_beta.csv']
     rows = csv.DictReader(near['dh_without_beta.csv'].splitlines()[1:])
     assert all(float(row['beta']) == 0.0 for row in rows)
 
