@@ -114,12 +114,7 @@ def _program(found: Columns, chain: Chain) -> tuple[Columns, tuple[str, ...], Fl
 
     ways = (names, [*joints], [name.upper() for name in names])
     names = next((each for each in ways if {*needed(each)} <= {*header}), names)
-    columns = []
-    for name in names:
-        several = [found.header[k] for k in places(found.header, name)]
-        if len(several) > 1:
-            raise InputError(f'{found.path} has several columns {", ".join(several)}: keep one')
-        columns.append((several or [name])[0])
+    columns = [_column(found, name) for name in names]
     units = _units(found, chain, columns)
     how = '; values are in rad or m, or in the unit named there: q1 [deg]'
     how += '; of a Fanuc q3 = J3 + J2' * ('J3' in header)
@@ -154,12 +149,30 @@ def _units(found: Columns, chain: Chain, columns: Sequence[str]) -> FloatArray:
 
 
 def read_poses(path: Path) -> FloatArray:
-    """Read poses (N, 4, 4) from the columns x y z [m] and qx qy qz qw of a CSV."""
+    """Read poses (N, 4, 4) from the columns x y z and qx qy qz qw of a CSV.
+
+    Lengths are in m, or in the units of the header, x [mm].
+    """
     table, *_ = _columns(path)
-    found = _with_decimals(with_rows(table, POSE_COLUMNS), POSE_COLUMNS)
-    numbers = found.block(POSE_COLUMNS)
+    columns = [_column(table, name) for name in POSE_COLUMNS]
+    how = '; lengths are in m, or in the unit named there: x [mm]'
+    found = _with_decimals(with_rows(table, columns, how), columns)
+    numbers = found.block(columns)
+    told = {column: name_and_unit(column)[1] for column in columns[:3]}
+    for column, unit in told.items():
+        if unit not in (LENGTHS if any(told.values()) else ('',)):
+            raise InputError(f'{path}: {column} must be in {" or ".join(LENGTHS)}, as x, y and z')
+    numbers[:, :3] *= [LENGTHS.get(unit, 1.0) for unit in told.values()]
     check_quaternions(found, numbers[:, 3:])
     return se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
+
+
+def _column(found: Columns, name: str) -> str:
+    """Return the column of a name with its unit; the name if there is none."""
+    several = [found.header[k] for k in places(found.header, name)]
+    if len(several) > 1:
+        raise InputError(f'{found.path} has several columns {", ".join(several)}: keep one')
+    return (several or [name])[0]
 
 
 def joints_csv(joints: FloatArray) -> str:

@@ -144,6 +144,17 @@ def test_workspace_writes_tables_words_and_figures(run, folder, tmp_path):
     assert run('workspace', *arguments)[0] == 1
 
 
+def test_the_poses_of_a_task_may_have_units(tmp_path):
+    """They were asked for in the header, and refused there."""
+    path = tmp_path / 'task.csv'
+    path.write_text('x [mm];y [mm];z [cm];qx;qy;qz;qw\n100,5;200;30;0;0;0;1\n')
+    np.testing.assert_allclose(read_poses(path)[0, :3, 3], [0.1005, 0.2, 0.3])
+    for old, new in (('[cm]', '[deg]'), (' [deg]', '')):
+        path.write_text(path.read_text().replace(old, new))
+        with pytest.raises(InputError, match=r'z.* must be in m or cm'):
+            read_poses(path)
+
+
 def test_workspace_places_a_task(run, folder, tmp_path):
     task = TASK[::2]
     values = np.column_stack([task[:, :3, 3], to_quat(task[:, :3, :3])])
