@@ -120,6 +120,13 @@ class Columns:
             parse_number(float(found[row, k]), self.where(row, names[k]), InputError, largest)
         return found
 
+    def joint_values(self, names: Sequence[str]) -> FloatArray:
+        """Return the numbers (N, len(names)) of joints beside measurements."""
+        told = 'must not be empty: each row needs joint values beside what was measured; of '
+        told += 'recordings keep one row for each stop with both, or give a bag'
+        self.refuse(self.blank(names[0]), f'{names[0]} {told}')
+        return self.block(names)
+
     def integers(self, name: str, blank: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """Return the integers (N,) of a column; `blank` (N,) replaces empty cells."""
         texts = self.texts(name)

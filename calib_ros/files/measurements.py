@@ -213,7 +213,7 @@ def measurements(columns: Columns, joints: int) -> Measurements:
     kind = filled.argmax(axis=0)
     placed = kind == POSE
     count = len(columns.lines)
-    angles = columns.block(joint_columns(joints))
+    angles = columns.joint_values(joint_columns(joints))
     position = _block(columns, POSITION, placed)
     oriented, rotation = _turned(columns, _block(columns, QUATERNION, False), placed)
     signs = _block(columns, joint_columns(joints, 's'), False, LARGEST_RATE)

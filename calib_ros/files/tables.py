@@ -84,8 +84,8 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
         raise ColumnsError(f'{path}: {doubt}')
     found, left = without_statistics(found)
     kept, skipped = measured(found)
-    if skipped:  # of whole rows: others were cut off
-        found.block([name for name in joint_columns(joints) if name in cells])
+    if skipped and 'q1' in cells:  # of whole rows: others were cut off
+        found.joint_values([name for name in joint_columns(joints) if name in cells])
     if {*MATRIX} <= {*cells}:
         raise ColumnsError(f'{path} has rotation matrices: calib_ros import makes quaternions')
     notes = [f'{path}: the column {name} is read as {ours}' for name, ours in meant.items()]

@@ -162,6 +162,16 @@ def test_a_lost_target_is_no_position(tmp_path, lost):
         read_table(path, 2)
 
 
+def test_joint_values_and_measurements_in_rows_of_their_own_are_told(tmp_path):
+    """As two recordings merged by time are written."""
+    path = tmp_path / 'cell.csv'
+    rows = ''.join(f'{k},0.{k},0.2,,,\n{k}.5,,,1,2,3\n' for k in range(4))
+    path.write_text(f'stamp,q1,q2,x,y,z\n{rows}')
+    for foreign in (None, Foreign(Layout(), ARM)):
+        with pytest.raises(InputError, match=r'line 3: q1 must not be empty: .* give a bag'):
+            read_table(path, 2, foreign=foreign)
+
+
 def test_lost_targets_are_known_in_any_unit(tmp_path):
     path = tmp_path / 'cell.csv'
     path.write_text(f'{PLAIN}0.2,0.3,-9999,-9999,-9999\n'.replace('x,y,z', 'x [mm],y [mm],z [mm]'))
