@@ -63,7 +63,7 @@ def read_table(
     elif path.is_file():  # a pipe can be read once only
         read = of_journal(path, joints, progress)
     found, warnings = read or _of_csv(path, joints, progress)
-    found, more = _without_names(found)
+    found, more = _without_others(found)
     warnings = (*warnings, *more)
     rows, by_line = _chosen(found, joints, sessions), 'stamp_ns' not in found.cells
     return _dataset(rows, sigmas, eye_in_hand, warnings, by_line)
@@ -102,16 +102,25 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
     return kept, (*notes, *not_read(path, [name for name in cells if name not in known]))
 
 
-def _without_names(found: Columns) -> tuple[Columns, tuple[str, ...]]:
-    """Return columns without those of targets or devices that name each row another, and notes.
+def _without_others(found: Columns) -> tuple[Columns, tuple[str, ...]]:
+    """Return columns without those that only seem to be ours, and notes.
 
-    SpatialAnalyzer calls a point so.
+    Trackers write the distance of each point beside its coordinates, and SpatialAnalyzer calls the
+    name of a point its target.
     """
-    count = len(found.lines)
-    names = [n for n in ('target', 'device') if len(found.labels(n)[1]) == count > len(POSITION)]
-    cells = {name: given for name, given in found.cells.items() if name not in names}
-    told = '{}: the column {} has another name in each row: it is left out, as a name of poses'
-    return replace(found, cells=cells), tuple(told.format(found.path, name) for name in names)
+    count, told = len(found.lines), dict[str, str]()
+    for name in ('target', 'device'):
+        if len(found.labels(name)[1]) == count > len(POSITION):
+            told[name] = 'has another name in each row: it is left out, as a name of poses'
+    for name in ('distance', 'plane') if 'x' in found.cells else ():
+        filled = ~found.blank(name)
+        if filled.any() and not (filled & found.blank('x')).any():
+            told[name] = 'is left out: x, y, z are in all of its rows'
+    if not told:
+        return found, ()
+    cells = {name: given for name, given in found.cells.items() if name not in told}
+    notes = (f'{found.path}: the column {name} {why}' for name, why in told.items())
+    return replace(found, cells=cells), tuple(notes)
 
 
 def _chosen(found: Columns, joints: int, sessions: Sequence[str]) -> Measurements:
@@ -181,5 +190,5 @@ def check_table(made: Columns) -> None:
             'chain with those joint names (--chain), or their separate table (--joints)'
         )
     sessions = made.texts('session') if 'session' in made.cells else ()
-    made, _ = _without_names(made)
+    made, _ = _without_others(made)
     _dataset(_chosen(made, joints, tuple(dict.fromkeys(sessions))))

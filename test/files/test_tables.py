@@ -139,7 +139,7 @@ FAULTS = [
       for each in ('nan', 'inf', '-inf', '', ' ', 'twelve', '1;2')),
     (POINTS.replace('5.5', '5.5 mm'), r'y must be .*: write its unit into the header, y \[mm\]'),
     (POINTS.replace('5.5', '"0,5"'), "line 3: y must be .*, not '0,5': write a point"),
-    ('q1,q2,x,y,z,distance\n0,0,1,2,3,\n0,0,1,2,3,4\n', 'has both x and distance: .*, or rename'),
+    ('q1,q2,x,y,z,distance\n0,0,,,,3\n0,0,1,2,3,4\n', 'line 3 has both x and distance: '),
     ('q1,q2,location,socket\n0,0,A,1\n0,0,B,1_2\n', 'line 3: socket must be LOCATION/SOCKET'),
     *((POINTS.replace('5.5', each), r'cell\.csv, line 3: y must be') for each in
       ('1e160', '-1e7', '²')),
@@ -266,6 +266,17 @@ def test_a_name_in_another_case_is_told_and_two_are_not_read(tmp_path):
     assert read_table(path, 2).warnings == (f'{path}: the column Target is read as target',)
     path.write_text('q1,q2,x,y,z,Target,TARGET\n0,0,1,2,3,a,b\n')
     assert 'columns not read: Target, TARGET (' in read_table(path, 2).warnings[0]
+
+
+@pytest.mark.parametrize('column', ['distance', 'Distance [mm]', 'plane'])
+def test_distances_beside_coordinates_are_no_measurements_of_their_own(tmp_path, column):
+    """As trackers write them; the column had to be renamed."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(f'q1;q2;x;y;z;{column}\n0,1;0;1;2;3;4\n0,2;0;1;2;3;\n')
+    arm = Chain('arm', 'standard', (Joint('a'), Joint('b')))
+    table = loading.table(path, arm, Settings())
+    assert [len(each) for each in table.fitted] == [2]
+    assert 'is left out: x, y, z are in all of its rows' in table.warnings[-1]
 
 
 @pytest.mark.parametrize('separator', [',', ';'])
