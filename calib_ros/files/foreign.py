@@ -75,7 +75,10 @@ class Foreign:
             how = f'by the column "{matched}"' if matched else 'row by row'
             notes += [f'{self.log}: {note}' for note in log.notes]
             notes.append(f'{self.log}: holds the joint values of {path}, matched {how}')
-            made = replace(made, cells={**joints, **made.cells})
+            cells = {**joints, **made.cells}
+            if matched.lower() == 'target':  # it names the poses
+                del cells['target']
+            made = replace(made, cells=cells)
         if not self.layout.source:  # a preset is known to leave some out
             notes += not_read(path, [name for name in table.unread() if name != matched])
             if not {*QUATERNION, *TURNS, *IN_TURN} & {*made.cells}:
@@ -307,7 +310,8 @@ def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
         if kind != same:
             continue
         ours, others = Counter(named), Counter(logged)
-        wrong = [cell for cell in named if ours[cell] != 1 or others[cell] != 1]
+        often = min(ours.values()) > 1 and 2 * len(ours) >= len(logged)  # each pose
+        wrong = [cell for cell in named if others[cell] != 1 or not (often or ours[cell] == 1)]
         if not wrong:
             rows = {cell: row for row, cell in enumerate(logged)}
             return name, np.array([rows[cell] for cell in named])

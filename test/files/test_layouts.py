@@ -266,6 +266,7 @@ def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_h
         ('A,P2,2,0,0\nA,P10,10,0,0\n', 'Point,q1\nP[10],10\nP[2],2\n', ''),
         ('Point,x,y,z\nP1.1,2,0,0\nP11,1,0,0\n', 'Position,q1\nP1.1,2\nP11,1\n', ''),
         ('No,At,x,y,z\n1,a,1,0,0\n2,b,2,0,0\n', 'No,At,q1\n1,b,2\n2,a,1\n', ''),
+        ('Target,x,y,z\na,1,0,0\nb,2,0,0\na,1,0,0\nb,2,0,0\n', 'At,q1\nb,2\na,1\n', ''),
         (
             'No,At,x,y,z\n1,a,1,0,0\n2,b,2,0,0\n3,c,3,0,0\n',
             'No,At,q1\n1,a,1\n2,b,2\n3,d,3\n',
