@@ -9,13 +9,14 @@ arm, not just a less accurate one, so the result is refused.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from scipy import special
 
 from calib_ros.decision.acceptance import out_of_scale
+from calib_ros.decision.delays import uneven
 from calib_ros.decision.misfits import explained_share
 from calib_ros.decision.printed_board import stretched
 from calib_ros.decision.reasons import Reason, Rule
@@ -204,10 +205,25 @@ def _lag(problem: Problem, result: Identification) -> Identification:
     known = {each.rule for each in result.refusals} & {Rule.MISTAKE, Rule.ENCODER, Rule.MOVED}
     if result.noise.position <= 1.0 or known:
         return result
-    if any(each.velocity is not None for each in problem.sets):
-        return _uneven(problem, result)
-    if any(each.pixels is not None for each in problem.sets):
+    if all(each.velocity is None for each in problem.sets):
+        found = _behind(problem, result)
+    else:
+        found = uneven(problem, result)
+    if found is None:
         return result
+    text, other = found
+    if other is not None and _imitated(other, result):
+        return replace(result, refusals=(Reason(Rule.LAG, text), *result.refusals))
+    return replace(result, remarks=(*result.remarks, text))
+
+
+def _behind(problem: Problem, result: Identification) -> tuple[str, Problem | None] | None:
+    """Return that poses lie towards the previous stop, and the problem with that delay.
+
+    Or that the joints have play, without a problem; None for images, or if neither explains most.
+    """
+    if any(each.pixels is not None for each in problem.sets):
+        return None
     first, *more = map(_with_moves, problem.sets)
     bases = sorted({each.base for each in problem.sets})
     late, chain = replace(problem, observations=first, more=more), result.chain
@@ -216,57 +232,20 @@ def _lag(problem: Problem, result: Identification) -> Identification:
     delays = [Parameter(name, DELAY) for name in bases]
     share = explained_share(late, chain, result.names, delays)
     if share < EXPLAINED:
-        return result
+        return None
     play = [name for name in effects.members(chain, 'backlash') if name not in result.names]
     played = explained_share(late, chain.with_effects(play), result.names, play)
     if played > share:
-        text = (
+        return (
             f'the joints have play, which explains {100.0 * played:.0f} % of the residuals: '
             'reach each pose from the same side, or fit the play (model auto) with the signs of '
             'the last moves (s1 ... sn)'
-        )
-        return replace(result, remarks=(*result.remarks, text))
-    text = (
+        ), None
+    return (
         f'poses lie towards the previous stop, which explains {100.0 * share:.0f} % of the '
         'residuals: the device smooths, stamps are late, or the arm creeps. Set settle to the '
         'time until measurements rest, and stop for longer'
-    )
-    if _imitated(late, result):
-        return replace(result, refusals=(Reason(Rule.LAG, text), *result.refusals))
-    return replace(result, remarks=(*result.remarks, text))
-
-
-def _uneven(problem: Problem, result: Identification) -> Identification:
-    """Return the result with joints that are late in motion, each in its way, refused if it harms.
-
-    Delays are play with the speed for its sign; where true play explains more, it is that.
-    """
-    joints = effects.members(result.chain, 'backlash')
-    if set(joints) & set(result.names):
-        return result
-
-    def moving(rate: Callable[[FloatArray], FloatArray]) -> Problem:
-        first, *more = (
-            replace(s, approach=None if s.velocity is None else rate(s.velocity))
-            for s in problem.sets
-        )
-        return replace(problem, observations=first, more=more)
-
-    def share(at: Problem, names: Sequence[str]) -> float:
-        return explained_share(at, result.chain.with_effects(names), result.names, names)
-
-    late = moving(np.positive)
-    explained = share(late, joints)
-    if explained < EXPLAINED or explained < share(moving(np.sign), joints):
-        return result
-    most = Parameter(max(joints, key=lambda name: share(late, [name]))).owner
-    text = (
-        f'joints late by different times explain {100.0 * explained:.0f} % of the residuals, '
-        f'above all {most}: read all joints at one moment, or stop at each pose (mode dwell)'
-    )
-    if _imitated(replace(late, effects=(*problem.effects, *joints)), result):
-        return replace(result, refusals=(Reason(Rule.LAG, text), *result.refusals))
-    return replace(result, remarks=(*result.remarks, text))
+    ), late
 
 
 def _with_moves(each: Observations) -> Observations:

@@ -1,0 +1,98 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Delays in motion that are not one constant: an arm imitates them along its path.
+
+The delay of each device is fitted. Joints that are not read at one moment have delays of their
+own, and clocks that drift apart or jump one that changes, here by cosines over the session. Such a
+delay d moves a joint by -d times its speed: play with the speed for the sign of the approach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+
+from calib_ros.decision.result import Identification
+from calib_ros.decision.steps import EXPLAINED
+from calib_ros.estimation.leastsquares import stacked
+from calib_ros.estimation.levels import TELLING
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.parameter import Parameter
+from calib_ros.kinematics.se3 import FloatArray, norms
+
+_Modes: TypeAlias = Callable[[Observations], FloatArray]
+"""Return how K delays make up those of N samples and L joints (K, N, L)."""
+
+
+def uneven(problem: Problem, result: Identification) -> tuple[str, Problem] | None:
+    """Return what explains most of the residuals, and the problem without it; None if nothing.
+
+    Where true play explains more, it is that.
+    """
+    lags = [Parameter(name) for name in effects.members(result.chain, 'backlash')]
+    if set(lags) & set(result.names):
+        return None
+    stamps = np.concatenate([each.stamps_ns for each in problem.sets])
+    first, whole = stamps.min(), max(np.ptp(stamps), 1)
+
+    def by_joint(each: Observations) -> FloatArray:
+        return np.eye(len(lags))[:, np.newaxis].repeat(len(each), axis=1)
+
+    def in_time(each: Observations) -> FloatArray:
+        order = np.arange(1, 1 + TELLING)
+        waves = np.cos(np.pi * np.outer(order, (each.stamps_ns - first) / whole))
+        return waves[..., np.newaxis].repeat(len(lags), axis=2)
+
+    by_play, _, _ = _explained(problem, result, lags, by_joint, np.sign)
+    found = [(_explained(problem, result, lags, m, np.positive), m) for m in (by_joint, in_time)]
+    (share, sizes, strong), modes = max(found, key=lambda each: each[0][0])
+    if share < EXPLAINED or share < by_play:
+        return None
+    text = 'a delay that changes explains'
+    remedy = 'clocks drift apart or jump: stamp with one clock'
+    if modes is by_joint:
+        text = 'joints late by different times explain'
+        remedy = f'above all {lags[int(np.argmax(strong))].owner}: read all joints at one moment'
+    text += f' {100.0 * share:.0f} % of the residuals, {remedy}, or stop at each pose (mode dwell)'
+    own = [list(problem.chain.joint_names).index(name.owner) for name in lags]
+    sets = []
+    for each in problem.sets:
+        joints = each.joints.copy()
+        if each.velocity is not None:
+            joints[:, own] += each.velocity[:, own] * np.einsum('k,knl->nl', sizes, modes(each))
+        sets.append(replace(each, joints=joints))
+    return text, replace(problem, observations=sets[0], more=sets[1:])
+
+
+def _explained(
+    problem: Problem,
+    result: Identification,
+    lags: list[Parameter],
+    modes: _Modes,
+    rate: Callable[[FloatArray], FloatArray],
+) -> tuple[float, FloatArray, FloatArray]:
+    """Return the share of the residual squares by K delays, their sizes and effects (K,)."""
+    few, count = [each.spread() for each in problem.sets], len(result.names)
+    few = [replace(s, approach=None if s.velocity is None else rate(s.velocity)) for s in few]
+    chain = result.chain.with_effects(lags)
+    rows = problem.system(few).rows_of(chain, [*result.names, *lags])
+    added = [
+        np.einsum('knl,lcn->kcn', modes(each), part[count:-1])
+        for each, part in zip(few, rows, strict=True)
+    ]
+    parts = zip(rows, added, strict=True)
+    matrix = stacked([np.concatenate([part[:count], more, part[-1:]]) for part, more in parts])
+    known, wanted = matrix[:, :-1], matrix[:, -1]
+    if len(matrix) - known.shape[1] < len(matrix) // 3:
+        return 0.0, np.zeros(len(lags)), np.zeros(len(lags))
+    sizes = np.linalg.lstsq(known, wanted)[0]
+    alone = wanted - known[:, :count] @ np.linalg.lstsq(known[:, :count], wanted)[0]
+    left = wanted - known @ sizes
+    share = 1.0 - float(left @ left) / max(float(alone @ alone), 1e-300)
+    delays = np.asarray(sizes[count:])
+    return share, delays, np.abs(delays) * norms(known[:, count:].T)
