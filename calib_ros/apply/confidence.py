@@ -59,15 +59,17 @@ def rms_limits(
 def rms_interval(errors: FloatArray, group: Index) -> tuple[float, float]:
     """Return the 95 % interval [m] of the RMS of errors (N, 3) over poses like these.
 
-    `group` (N,) are the configurations, each counted once; with a single one they are (0, inf).
+    Repeats in a configuration, by `group` (N,), share its error: those with shares w of the pairs
+    tell as much as 1 / sum w^2 alike. With a single one the limits are (0, inf).
     """
-    moments = moments_of(errors, successive(group))
+    number = successive(group)
+    moments, shares = moments_of(errors, number), np.bincount(number) / len(number)
     if len(moments) < 2:
         return 0.0, np.inf
     rms = float(np.sqrt(np.mean(norms(errors) ** 2)))
     if rms == 0.0:
         return 0.0, 0.0
-    freedom = np.array([freedom_of(moments) * len(moments)])
+    freedom = np.array([freedom_of(moments) / np.sum(shares**2)])
     lower, upper = rms_limits(rms, freedom, CONFIDENT)
     return float(lower[0]), float(upper[0])
 

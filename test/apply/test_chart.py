@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The chart of verification errors: run lengths, false alarms, and what it finds."""
+"""The chart of verification errors: run lengths, false alarms, and what it finds; intervals."""
 
 import numpy as np
 import pytest
 
-from calib_ros.apply.confidence import drift, run_length
+from calib_ros.apply.confidence import drift, rms_interval, run_length
 from calib_ros.errors import InputError
 
 
@@ -45,3 +45,14 @@ def test_what_are_no_errors_is_refused():
         with pytest.raises(InputError, match='degrees of freedom of nights'):
             drift(rms, freedom, 100.0)
     assert drift([], [], 100.0).alarms == ()
+
+
+@pytest.mark.parametrize('most', [1, 30, 500])
+def test_a_pose_measured_again_and_again_tells_no_more(most):
+    """Of 30 poses, one of them measured 30 times, the interval held the truth in 63 %."""
+    rng, group = np.random.default_rng(2), np.repeat(np.arange(30), [most, *[1] * 29])
+    truth, held = np.sqrt(3.0), []
+    for errors in rng.normal(size=(400, 30, 3)):
+        lower, upper = rms_interval(errors[group], group)
+        held.append(lower <= truth <= upper)
+    assert np.mean(held) > 0.93
