@@ -8,6 +8,7 @@ Rows that cannot be written, as on a full disk, wait in memory.
 from __future__ import annotations
 
 import re
+import stat
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timezone
@@ -233,4 +234,13 @@ class Archive:
 
     def _files(self, ending: str) -> list[Path]:
         found = (path for _, ends, path in sorted(self._dated()) if ends == ending)
-        return [path for path in found if path.is_file() and path.stat().st_size]
+        return [path for path in found if _holds_any(path)]
+
+
+def _holds_any(path: Path) -> bool:
+    """Tell whether a path is a file that is not empty; a link to a lost one may be."""
+    try:
+        found = path.stat()
+    except OSError:
+        return True
+    return stat.S_ISREG(found.st_mode) and found.st_size > 0

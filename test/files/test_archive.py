@@ -83,18 +83,24 @@ def test_robots_with_similar_and_with_long_names_have_files_of_their_own(tmp_pat
     assert {'arm+12_3', 'arm+12%2F3', 'arm+ö'} < files
 
 
-def test_what_is_named_like_a_journal_and_is_none_is_not_resumed(tmp_path):
-    """A link to a file that had been moved away kept the node from starting."""
+def test_a_folder_named_like_a_journal_is_none_and_a_lost_one_is_told_when_it_is_read(tmp_path):
+    """A link to a journal that had been moved away kept a node without resume from starting."""
     archive = open_archive(tmp_path)
     archive.add(sample(1))
     archive.save('calibration: 1', 'settings: 1')
     archive.close()
     for ending in ('.csv', '.yaml'):
-        (tmp_path / f'arm_99901231T235959999998Z{ending}').symlink_to(tmp_path / 'moved away')
         (tmp_path / f'arm_99901231T235959999999Z{ending}').mkdir()
     archive = open_archive(tmp_path)
     assert [each.stamp_ns for each in archive.resume()[0]] == [1]
     assert archive.newest_calibration().read_text() == 'calibration: 1'
+    archive.close()
+    lost = tmp_path / 'arm_99901231T235959999998Z.csv'
+    lost.symlink_to(tmp_path / 'on a disk that is not there')
+    archive = open_archive(tmp_path)
+    assert archive.newest_journal() == lost
+    with pytest.raises(InputError, match=f'{lost}.* It is left untouched'):
+        archive.resume()
 
 
 def test_the_newest_journal_is_resumed_when_the_clock_was_set_back(tmp_path):

@@ -224,7 +224,8 @@ def test_a_node_that_could_keep_no_samples_ends_with_one_clear_line(tmp_path, ca
     """As with a journal on a disk that is not there, or of another user."""
     path = tmp_path / 'ur10e_20260102T030405000006Z.csv'
     path.symlink_to(tmp_path / 'elsewhere' / path.name)
-    for folder, said in (('/proc/nope', 'poses cannot be kept in /proc/nope'), (tmp_path, path)):
+    unkept, unread = 'poses cannot be kept in /proc/nope', f'cannot read {path}'
+    for folder, said in (('/proc/nope', unkept), (tmp_path, unread)):
         assert ended_by('chain:=ur10e', f'data_dir:={folder}', 'resume:=true') == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f'calibration_node: {said}')
