@@ -85,7 +85,8 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
         sigmas = ''
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
     level, other = _level(problem, result), _another_type(problem, result) if another else ''
-    found = (other, lens, board, coupled, level, motion, _order(problem), sigmas)
+    judged = _elsewhere(problem, result) if another else ''
+    found = (other, lens, board, judged, coupled, level, motion, _order(problem), sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
     return _lag(problem, replace(result, remarks=remarks, refusals=tuple(refusals)))
 
@@ -181,6 +182,31 @@ def _motion(problem: Problem, result: Identification) -> str:
                     'device or the joint states are smoothed. Stop at each pose (mode dwell)'
                 )
     return ''
+
+
+def _elsewhere(problem: Problem, result: Identification) -> str:
+    """Return that held-out positions are further off than noise and expected errors make them."""
+    sets, judged = problem.judging, result.validation
+    if judged is None or judged.repeated is None:
+        return ''
+    if any(each.distances is not None or each.pixels is not None for each in sets):
+        return ''
+    sigmas = problem.sigma_position, problem.sigma_orientation
+    squares = [
+        result.noise.position**2 * each.covariances(sigmas)
+        + result.posterior.expected(each.joints, each.base, each.tool)
+        for each in sets
+    ]
+    sizes = np.trace(np.concatenate(squares)[:, :3, :3], axis1=1, axis2=2)
+    likely = 1e3 * float(np.sqrt(sizes[judged.deciding].mean()))
+    found = judged.figures[1].rms_mm
+    if likely > NEARER * found:
+        return ''
+    return (
+        f'the held-out poses are {found / likely:.1f} times as far off as the fitted ones let '
+        'expect: are device, target and arm the same, unmoved and true to scale? Stated errors '
+        'hold for the fitted poses alone'
+    )
 
 
 def _order(problem: Problem) -> str:

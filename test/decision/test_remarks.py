@@ -205,6 +205,8 @@ class Judged:
         ({'given': 'mistake', 'sigmas': 's'}, False, ['mistake', 's'], []),
         ({'coupled': True, 'motion': 'fast', 'order': 'one way'}, True, [], ['fast', 'one way']),
         ({'level': 'tool.z', 'motion': 'fast'}, True, [], ['tool.z', 'fast']),
+        ({'unseen': 'off', 'lens': 'lens'}, True, [], ['lens', 'off']),
+        ({'unseen': 'off', 'given': 'mistake'}, False, ['mistake'], []),
         ({'type': 'joint_3.d', 'lens': 'lens'}, True, [], ['joint_3.d', 'lens']),
     ],
 )
@@ -218,6 +220,7 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
         '_sessions': found.get('sessions', ''),
         '_another_type': found.get('type', ''),
         '_level': found.get('level', ''),
+        '_elsewhere': found.get('unseen', ''),
         '_motion': found.get('motion', ''),
     }
     for name, part in parts.items():
