@@ -303,7 +303,7 @@ def csv_blocks(
             if block := [(above + last, row) for last, row in rows if any(row)]:
                 yield block
     except csv.Error as err:
-        raise (InputError if line else ColumnsError)(  # other separators may suit the header
+        raise (InputError if width > 1 else ColumnsError)(  # other separators may suit the header
             f'cannot read {path} from line {above + line + 1}: {err}: are its quotation marks '
             'paired?'
         ) from err

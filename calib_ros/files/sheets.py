@@ -114,6 +114,9 @@ def _of_text(path: Path, layout: Layout) -> _Content:
         comments, text = comment.findall(text), comment.sub('', text)
     # a header, as numpy and SpatialAnalyzer write it
     text = re.sub(r'(?m)^(?:[#%]+[ \t]+|//[ \t]*)(?=[A-Za-z])', '', text)
+    if text.startswith('"') and not re.search(r'(?m)^(?!"[^"\n]*"$)[^\n]', text):  # one cell each
+        text = re.sub('(?m)^"|"$', '', text)
+        notes.append('whole lines are in quotation marks: read without them')
     guessed = _separator(path, text)
     if guessed != 'comma' and not layout.cut:
         notes.append(f'cells are separated by {guessed}s (--separator)')
@@ -292,6 +295,9 @@ def _separator(path: Path, text: str) -> str:
         told = [_is_number(cell, ',') for cell in below if cell.strip()]
         if name == 'bar' and 2 * sum(told) <= len(told):  # it is in names
             continue
+        inner = [re.search(r'[0-9][ \t]+[-+]?[0-9]', cell) is not None for cell in below]
+        if name == 'comma' and 2 * sum(inner) > len(below):  # it is in numbers
+            continue
         if agreed > 1.2 * most or (finer and all(_is_number(cell, '.') for cell in below)):
             best, most, cells = name, agreed, usual
     return best
@@ -343,6 +349,8 @@ def _first(
     none += [
         f'line {line} has "{cells[i]}": numbers without units are expected there; other columns '
         'are named by --columns OURS=NAME or OURS=#NUMBER'
+        + '; if the comma is a decimal one, give --decimal comma'
+        * (',' in cells[i])
         for line, cells in rows[at + 1 : at + 2]
         for i in used[:1]
         if i < len(cells)

@@ -3,16 +3,14 @@
 """Forms in which other systems write the same table."""
 
 import re
-import sys
-import zipfile
 
 import numpy as np
 import pytest
-from test_foreign import JOINTS, NAMES, PLACES, PLAIN, TURNED, assert_same, text_of
+from test_foreign import JOINTS, PLACES, PLAIN, TURNED, assert_same, text_of
 
 from calib_ros import Chain, Settings, read_table
-from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
-from calib_ros.files import loading, workbooks
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, layout_of
 from calib_ros.files.vocabulary import MATRIX, SEPARATORS
@@ -24,6 +22,9 @@ FORMS = {
     'a header of numpy': '# ' + PLAIN,
     'a header of numpy with blanks': '# two joints\n# ' + PLAIN.replace(',', ' '),
     'a header of SpatialAnalyzer': '//' + PLAIN,
+    'whole lines in quotes': re.sub('(?m)^.+$', r'"\g<0>"', PLAIN),
+    'quotes below a plain header': re.sub('(?m)^([0-9-].*?);', r'"\1";', PLAIN.replace(',', ';')),
+    'decimal commas between blanks': PLAIN.replace(',', ' ').replace('.', ','),
     'bars': PLAIN.replace(',', '|'),
     'names between bars': re.sub('(?m)^.+$', r'|a|b|c|\g<0>|', PLAIN.replace(',', '|')),
     'a table of Markdown': re.sub('(?m)^.+$', r'| \g<0> |', PLAIN.replace(',', ' | ')).replace(
@@ -329,72 +330,3 @@ def test_the_joints_with_motors_of_an_arm_whose_hand_is_kept_level_are_told(tmp_
     path.write_text('q1,q2,x,y,z\n1,2,3,4,5\n2,2,3,4,6\n')
     with pytest.raises(InputError, match='joints with motors: --columns "q3=#2,q2=0"'):
         read_table(path, 3, foreign=Foreign(Layout(), arm))
-
-
-def test_workbooks(tmp_path, monkeypatch):
-    openpyxl = pytest.importorskip('openpyxl')
-    book = openpyxl.Workbook()
-    book.active.title = 'first'
-    sheet = book.create_sheet('measured')
-    for row in (
-        ['a title'],
-        NAMES,
-        ['rad', 'rad', 'm', 'm', 'm'],
-        *np.column_stack([JOINTS, PLACES]).tolist(),
-    ):
-        sheet.append(row)
-    path = tmp_path / 'cell.xlsx'
-    book.save(path)
-    assert_same(read_table(path, 2, foreign=Foreign(Layout(sheet='measured'))), None)
-    with pytest.raises(InputError, match='no sheet "other"; it has first, measured'):
-        read_table(path, 2, foreign=Foreign(Layout(sheet='other')))
-    other = book.create_sheet('later')
-    other.append(NAMES)
-    book['first'].sheet_state = 'hidden'
-    book.save(path)
-    found = read_table(path, 2, foreign=Foreign(Layout()))
-    assert_same(found, None)
-    assert 'there are no numbers in line 3: only units are read' in str(found.warnings)
-    assert 'sheet "measured" of 2 is read (--sheet)' in str(found.warnings)
-    book['first'].sheet_state = 'visible'
-    book['first'].append(['a protocol', 1])
-    points, log = book.create_sheet('points'), book.create_sheet('log')
-    for row in (['X [mm]', 'Y (mm)', 'Z / mm'], *(1e3 * PLACES).tolist()):
-        points.append(row)
-    for row in (['J1', 'J2'], ['deg', '°'], *np.rad2deg(JOINTS).tolist()):
-        log.append(row)
-    book.save(path)
-    assert_same(read_table(path, 2, foreign=Foreign(Layout())), None)
-    of_joints = Layout(columns={'q1': 'J1', 'q2': 'J2'})
-    apart = Foreign(Layout(sheet='points'), None, path, of_joints)
-    assert_same(read_table(path, 2, foreign=apart), None)
-    del book['points'], book['log']
-    book['first'].sheet_state = 'hidden'
-    book.save(path)
-    smaller = zipfile.ZipFile(tmp_path / 'smaller.xlsx', 'w')
-    with zipfile.ZipFile(path) as whole, smaller:
-        for name in whole.namelist():
-            text = re.sub(rb'<dimension ref="[^"]*"', b'<dimension ref="A1:E3"', whole.read(name))
-            smaller.writestr(name, text)
-    assert_same(read_table(tmp_path / 'smaller.xlsx', 2, foreign=Foreign(Layout())), None)
-    path.write_bytes(b'no workbook')
-    with pytest.raises(InputError, match='no workbook, or damaged: save it as'):
-        read_table(path, 2, foreign=Foreign(Layout()))
-    columns = {'eye_in_hand': 'e'} | {f'q{k}': f'q{k}' for k in (1, 2)}
-    for rows, said in (
-        ([], 'has no rows'),
-        ([['q'] * (MOST_ENTRIES + 1)], f'has {MOST_ENTRIES + 1} columns, more than'),
-        ([[*NAMES, 'e'], [1, 2, 3, 4, 5, True]], 'of a camera on the flange need an orientation'),
-    ):
-        book = openpyxl.Workbook()
-        for row in rows:
-            book.active.append(row)
-        book.save(path)
-        with pytest.raises(InputError, match=said):
-            read_table(path, 2, foreign=Foreign(Layout(columns=columns)))
-    monkeypatch.setattr(workbooks, 'LARGEST_SHEET', 100)
-    with pytest.raises(InputError, match='MB when unpacked'):
-        read_table(path, 2, foreign=Foreign(Layout()))
-    monkeypatch.setitem(sys.modules, 'openpyxl', None)
-    with pytest.raises(InputError, match=r'needs openpyxl: pip install "calib_ros\[xlsx\]"'):
-        read_table(path, 2, foreign=Foreign(Layout()))

@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Formulas in workbooks."""
+"""Workbooks: their sheets, and formulas."""
 
+import re
+import sys
 import zipfile
 
 import numpy as np
@@ -9,7 +11,8 @@ import pytest
 from test_foreign import JOINTS, NAMES, PLACES, assert_same
 
 from calib_ros import read_table
-from calib_ros.errors import InputError
+from calib_ros.errors import MOST_ENTRIES, InputError
+from calib_ros.files import workbooks
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout
 
@@ -63,3 +66,72 @@ def test_formulas_of_empty_text_are_empty(read):
     made = (f'r="D3">{FORMULA}', 'r="D3" t="str"><f>1/4</f><v></v>')
     with pytest.raises(InputError, match=r"line 3: y must be a finite number, not ''"):
         read('=1/4', made, LATER)
+
+
+def test_workbooks(tmp_path, monkeypatch):
+    openpyxl = pytest.importorskip('openpyxl')
+    book = openpyxl.Workbook()
+    book.active.title = 'first'
+    sheet = book.create_sheet('measured')
+    for row in (
+        ['a title'],
+        NAMES,
+        ['rad', 'rad', 'm', 'm', 'm'],
+        *np.column_stack([JOINTS, PLACES]).tolist(),
+    ):
+        sheet.append(row)
+    path = tmp_path / 'cell.xlsx'
+    book.save(path)
+    assert_same(read_table(path, 2, foreign=Foreign(Layout(sheet='measured'))), None)
+    with pytest.raises(InputError, match='no sheet "other"; it has first, measured'):
+        read_table(path, 2, foreign=Foreign(Layout(sheet='other')))
+    other = book.create_sheet('later')
+    other.append(NAMES)
+    book['first'].sheet_state = 'hidden'
+    book.save(path)
+    found = read_table(path, 2, foreign=Foreign(Layout()))
+    assert_same(found, None)
+    assert 'there are no numbers in line 3: only units are read' in str(found.warnings)
+    assert 'sheet "measured" of 2 is read (--sheet)' in str(found.warnings)
+    book['first'].sheet_state = 'visible'
+    book['first'].append(['a protocol', 1])
+    points, log = book.create_sheet('points'), book.create_sheet('log')
+    for row in (['X [mm]', 'Y (mm)', 'Z / mm'], *(1e3 * PLACES).tolist()):
+        points.append(row)
+    for row in (['J1', 'J2'], ['deg', '°'], *np.rad2deg(JOINTS).tolist()):
+        log.append(row)
+    book.save(path)
+    assert_same(read_table(path, 2, foreign=Foreign(Layout())), None)
+    of_joints = Layout(columns={'q1': 'J1', 'q2': 'J2'})
+    apart = Foreign(Layout(sheet='points'), None, path, of_joints)
+    assert_same(read_table(path, 2, foreign=apart), None)
+    del book['points'], book['log']
+    book['first'].sheet_state = 'hidden'
+    book.save(path)
+    smaller = zipfile.ZipFile(tmp_path / 'smaller.xlsx', 'w')
+    with zipfile.ZipFile(path) as whole, smaller:
+        for name in whole.namelist():
+            text = re.sub(rb'<dimension ref="[^"]*"', b'<dimension ref="A1:E3"', whole.read(name))
+            smaller.writestr(name, text)
+    assert_same(read_table(tmp_path / 'smaller.xlsx', 2, foreign=Foreign(Layout())), None)
+    path.write_bytes(b'no workbook')
+    with pytest.raises(InputError, match='no workbook, or damaged: save it as'):
+        read_table(path, 2, foreign=Foreign(Layout()))
+    columns = {'eye_in_hand': 'e'} | {f'q{k}': f'q{k}' for k in (1, 2)}
+    for rows, said in (
+        ([], 'has no rows'),
+        ([['q'] * (MOST_ENTRIES + 1)], f'has {MOST_ENTRIES + 1} columns, more than'),
+        ([[*NAMES, 'e'], [1, 2, 3, 4, 5, True]], 'of a camera on the flange need an orientation'),
+    ):
+        book = openpyxl.Workbook()
+        for row in rows:
+            book.active.append(row)
+        book.save(path)
+        with pytest.raises(InputError, match=said):
+            read_table(path, 2, foreign=Foreign(Layout(columns=columns)))
+    monkeypatch.setattr(workbooks, 'LARGEST_SHEET', 100)
+    with pytest.raises(InputError, match='MB when unpacked'):
+        read_table(path, 2, foreign=Foreign(Layout()))
+    monkeypatch.setitem(sys.modules, 'openpyxl', None)
+    with pytest.raises(InputError, match=r'needs openpyxl: pip install "calib_ros\[xlsx\]"'):
+        read_table(path, 2, foreign=Foreign(Layout()))
