@@ -5,14 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
-from calib_ros.errors import ColumnsError, TooFewObservationsError
+from calib_ros.errors import ColumnsError, InputError, TooFewObservationsError
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.bags import Replayed
 from calib_ros.files.foreign import Foreign
@@ -97,8 +96,14 @@ def table(
     given = path, len(chain.joints), sessions, settings.sigmas, eye_in_hand
     if foreign is None:
         refuse_other_joints_than(chain.joint_names, path)
-        with suppress(ColumnsError):
+        try:
             return read_table(*given, progress=progress)
+        except ColumnsError as err:
+            if not path.is_file():
+                raise InputError(
+                    f'{err}; of a pipe nothing is guessed, it is read once: save it as a file, or '
+                    'give an option for tables, such as --separator'
+                ) from err
         foreign = Foreign(Layout(), chain)
     return read_table(*given, foreign, progress)
 

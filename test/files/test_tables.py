@@ -1,5 +1,8 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -250,6 +253,17 @@ def test_without_options_a_table_of_others_is_read_as_far_as_it_can_be_guessed(
     found = loading.table(path, Chain('arm', 'standard', joints), Settings())
     np.testing.assert_array_equal(found.fitted[0].joints, [[0.1, 0.2], [-0.3, 0.4]])
     assert noted in ' '.join(found.warnings)
+
+
+def test_a_pipe_in_another_form_is_told_to_be_saved():
+    """What was left in it after the first look had no rows."""
+    end, begin = os.pipe()
+    os.write(begin, b'q1;q2;x;y;z\n0;0;1;2;3\n')
+    os.close(begin)
+    arm = Chain('arm', 'standard', (Joint('a'), Joint('b')))
+    with pytest.raises(InputError, match=r'by semicolons: .* it is read once: save it'):
+        loading.table(Path(f'/dev/fd/{end}'), arm, Settings())
+    os.close(end)
 
 
 @pytest.mark.parametrize('name', ['Session', 'SESSION', 'session'])
