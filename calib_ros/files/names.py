@@ -42,6 +42,11 @@ NOMINAL_WORDS = _set(
 )
 NOMINAL_TITLES = NOMINAL_WORDS - _set('target robot tcp ee model ref reference design prog fk')
 """Words that call the rows below a title nominal; others are of any cell."""
+TITLE_WORDS = _set(
+    'value values pose poses position positions point points coordinate coordinates data table '
+    'werte punkte positionen koordinaten'
+)
+"""Other words of such titles: `nominal speed` is a remark."""
 DEVIATION = _set('d dev deviation delta dif diff difference abw abweichung')
 TURNED = _set('q quat quaternion orientation rot rotation')
 DISTANCE_WORDS = _set('distance length wire abstand')

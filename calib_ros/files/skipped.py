@@ -15,7 +15,7 @@ import numpy as np
 
 from calib_ros.errors import LONGEST, MOST_ENTRIES, InputError
 from calib_ros.files.columns import BETWEEN, Cells, Columns, cell_number, lines_in_words
-from calib_ros.files.names import MEASURED_WORDS, NOMINAL_TITLES, words_of
+from calib_ros.files.names import MEASURED_WORDS, NOMINAL_TITLES, TITLE_WORDS, words_of
 from calib_ros.files.vocabulary import MEASURED_COLUMNS, POSITION
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.values import ROUNDED
@@ -78,12 +78,13 @@ def without_words(
 def refuse_nominal(columns: Columns, remarks: Iterable[Cells]) -> None:
     """Refuse rows below a title that calls them nominal, if other rows are below another one.
 
-    A title is a remark of at most three words; remarks above the header come first.
+    A title is a remark of such words and those of places; remarks above the header come first.
     """
     titles = [(0, False, '')]
     for line, cells in remarks:
         words = words_of(text := ' '.join(filter(None, cells)))
-        if len(words) <= 3 and {*words} & (NOMINAL_TITLES | MEASURED_WORDS):
+        told = NOMINAL_TITLES | MEASURED_WORDS
+        if {*words} & told and {*words} <= told | TITLE_WORDS:
             titles.append((line, bool({*words} & NOMINAL_TITLES), text))
     ends = np.searchsorted(columns.lines, [line for line, *_ in titles])
     counts = np.diff(ends, append=len(columns.lines))

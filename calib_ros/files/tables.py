@@ -85,7 +85,9 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
     found, left = without_statistics(found)
     kept, skipped = measured(found)
     if skipped and 'q1' in cells:  # of whole rows: others were cut off
-        found.joint_values([name for name in joint_columns(joints) if name in cells])
+        found.block([name for name in joint_columns(joints) if name in cells], needed=False)
+        if np.setdiff1d(found.lines[found.blank('q1')], kept.lines).size:
+            raise ColumnsError(f'{path} has rows without numbers')  # remarks, perhaps titles
     if {*MATRIX} <= {*cells}:
         raise ColumnsError(f'{path} has rotation matrices: calib_ros import makes quaternions')
     notes = [f'{path}: the column {name} is read as {ours}' for name, ours in meant.items()]
