@@ -166,10 +166,11 @@ def causes(found: Verification) -> list[str]:
             'calib_ros compensate'
         )
     rms, common = 1e-3 * found.comparison.figures[1].rms_mm, 100.0 * found.common
+    largest = max(Settings.largest_error, found.limit or 0.0)
     if found.step or found.odd:
         lines += [f'something moved while you measured: {found.step}'] if found.step else []
         lines.append(_apart(found) if found.odd else 'put right what moved, and measure again')
-    elif (found.common if found.common < NEARER else 1.0) * rms > Settings.largest_error:
+    elif (found.common if found.common < NEARER else 1.0) * rms > largest:
         lines.append(
             'no arm is so far off: check units and columns of the measurements (--length, '
             '--joint-angle, --columns), their rows, the robot, whether the device (--new-base) or '

@@ -234,6 +234,8 @@ def test_units_are_named_though_a_common_motion_would_take_most_of_the_error(arm
     assert found.common < 0.1
     assert 'no arm is so far off' in text
     assert 'was the measuring device moved' not in text
+    coarse = with_errors(arm, np.random.default_rng(0).normal(scale=7e-3, size=(9, 3)))
+    assert 'no arm is so far off' not in in_words(verify(arm, [coarse], 1.5e-2))  # as wanted
 
 
 def test_one_pose_that_alone_exceeds_the_limit_is_named(arm):
