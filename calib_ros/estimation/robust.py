@@ -145,8 +145,9 @@ def reweighted(
 
     Fits are repeated to a `tolerance` until the weights converge: the more often they swing, the
     smaller their steps, lest they go round for ever. A sample at the edge may lose weight, come
-    nearer, regain it, and so on. With the distances (N,) of all samples by a `simpler` model,
-    samples that it explains are no gross errors: a richer model has to explain them too.
+    nearer, regain it, and so on. Weights that creep take the step of the secant. With the
+    distances (N,) of all samples by a `simpler` model, samples that it explains are no gross
+    errors: a richer model has to explain them too.
     """
     ends = np.cumsum([samples.count for samples in system.sets])[:-1]
 
@@ -156,7 +157,8 @@ def reweighted(
 
     distances = judged(chain)
     settled, swung = False, 0
-    last: FloatArray | None = None
+    moved: FloatArray | None = None  # the last move of the weights
+    due: FloatArray | None = None  # and the one that their fit asked for
     weights: FloatArray | None = None
     for _ in range(ROUNDS):
         found = weights_of(distances, loss)
@@ -164,11 +166,17 @@ def reweighted(
             settled = np.allclose(found, weights, rtol=0, atol=1e-4)
             if settled:
                 break
-            swings = last is not None and float((found - weights) @ (weights - last)) < 0.0
+            before, due = due, found - weights
+            swings = moved is not None and float(due @ moved) < 0.0
             swung += swings
             share = min(1.0, PATIENCE / (swung + 1.0)) * (0.5 if swings else 1.0)
-            found = share * found + (1.0 - share) * weights
-        last, weights = weights, found
+            if moved is not None and before is not None and not swings:
+                rate = float((before - due) @ moved) / max(float(moved @ moved), 1e-300)
+                creeps = np.abs(due).max() < 0.1 * rate < 0.1  # near where the secant leads
+                share /= rate if creeps else 1.0
+            moved = np.clip(weights + share * due, 0.0, 1.0) - weights
+            found = weights + moved
+        weights = found
         system = system.weighted(np.split(weights, ends))
         fit = minimise(chain, names, system, tolerance)
         chain = fit.chain
