@@ -231,7 +231,7 @@ def _read_csv(path: Path, chain: Chain) -> ProgramFile:
     def text_with(corrected: Program) -> str:
         lines = csv.reader(io.StringIO(text, newline=''), delimiter=separator)
         header, *rows = (row for row in lines if any(row))
-        place = {name.strip(): k for k, name in enumerate(header)}  # some may have no name
+        place = {' '.join(name.split()): k for k, name in enumerate(header)}  # some have no name
         given = [k for k, name in enumerate(names) if name in found.header]
         at = [place[names[k]] for k in given]
         for row, values in zip(rows, (corrected.positions / units[given]).tolist(), strict=True):

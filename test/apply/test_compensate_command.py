@@ -193,6 +193,16 @@ def test_columns_without_names_move_no_joint_value(tmp_path):
     assert source.text_with(source.program) == given
 
 
+@pytest.mark.parametrize('between', ['  ', '\n'])
+def test_a_program_may_have_any_blanks_in_its_header(tmp_path, between):
+    """Its columns were not found again when it was written."""
+    path = tmp_path / 'program.csv'
+    arm = Chain('arm', 'standard', (Joint('a'), Joint('b')))
+    path.write_text(given := f'"q1{between}[rad]","q2{between}[rad]"\n0.25,-1.5\n')
+    source = read_program(path, arm)
+    assert source.text_with(source.program).replace('"', '') == given.replace('"', '')
+
+
 @pytest.mark.parametrize('coding', ['utf-8-sig', 'utf-16', 'cp1252'])
 def test_a_program_keeps_its_separators_and_decimal_commas(tmp_path, coding):
     """As tables of measurements; they were refused, and had to be saved in another form."""
