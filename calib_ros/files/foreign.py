@@ -76,8 +76,8 @@ class Foreign:
             notes += [f'{self.log}: {note}' for note in log.notes]
             notes.append(f'{self.log}: holds the joint values of {path}, matched {how}')
             cells = {**joints, **made.cells}
-            if matched.lower() == 'target':  # it names the poses
-                del cells['target']
+            if matched.lower() == 'target' and 'target' not in self.layout.columns:
+                del cells['target']  # it names the poses
             made = replace(made, cells=cells)
         if not self.layout.source:  # a preset is known to leave some out
             notes += not_read(path, [name for name in table.unread() if name != matched])

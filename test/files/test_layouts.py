@@ -288,6 +288,15 @@ def test_names_of_poses_need_no_column_of_the_same_name(tmp_path, points, log, o
     assert found.joints[:, 0].tolist() == found.positions[:, 0].tolist()
 
 
+def test_a_column_of_targets_that_was_given_is_read_beside_one_of_poses(tmp_path):
+    """Where poses were matched by a column Target, both targets were taken for one."""
+    (tmp_path / 'log.csv').write_text('Target,q1\nP1,1\nP2,2\n')
+    (tmp_path / 'points.csv').write_text('Target,Probe,x,y,z\nP1,a,1,0,0\nP2,b,2,0,0\n')
+    given = Foreign(Layout(columns={'target': 'Probe'}), None, tmp_path / 'log.csv')
+    found = read_table(tmp_path / 'points.csv', 1, foreign=given).fitted
+    assert [len(each) for each in found] == [1, 1]
+
+
 @pytest.mark.parametrize(('names', 'refused'), [('q1,q2,x,y,z', True), (None, False)])
 def test_lines_of_several_units_are_refused_unless_each_column_has_its_own(
     tmp_path, names, refused
