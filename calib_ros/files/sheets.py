@@ -27,7 +27,7 @@ from calib_ros.files.columns import (
 )
 from calib_ros.files.headers import name_and_unit, only, places
 from calib_ros.files.layouts import Layout
-from calib_ros.files.skipped import refuse_nominal, without_words
+from calib_ros.files.skipped import refuse_nominal, without_statistics, without_words
 from calib_ros.files.vocabulary import (
     DECIMAL_COMMA,
     MISSING,
@@ -190,7 +190,11 @@ def _refuse_shifted(columns: Columns, width: int) -> None:
 
 
 def refuse_short(columns: Columns, last: str) -> None:
-    """Refuse a row between blanks without a cell in the last column, unless remarks are there."""
+    """Refuse a row between blanks without a cell in the last column, unless remarks are there.
+
+    Statistics need not have all columns.
+    """
+    columns, _ = without_statistics(columns)
     cells = columns.texts(last)
     if '' in cells and all(_is_number(cell, ',') or cell.lower() in MISSING for cell in cells):
         raise InputError(
@@ -211,11 +215,16 @@ def text_and_separator(path: Path) -> tuple[str, str]:
 
 
 def _narrow(text: str, separator: str) -> str:
-    """Return a text with single blanks between cells that blanks separate, none before units."""
+    """Return a text with single blanks between cells that blanks separate.
+
+    In lines without numbers, there are none before units.
+    """
     if separator != ' ':
         return text
     text = re.sub(r'[ \t]+', ' ', re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text))
-    return re.sub(r'(?<=\w) (?=[\[(](?:[^\W\d]{1,12}|[°º])[\])])', '', text)  # q1 [deg]
+    words = r'(?m)^(?!(?:.* )?[-+.\d]+(?:e\S+)?(?: |$)).*[\[(].*'
+    before = re.compile(r'(?<=\w) (?=[\[(](?:[^\W\d]{1,12}|[°º])[\])])')  # q1 [deg]
+    return re.sub(words, lambda line: before.sub('', line[0]), text)
 
 
 def decimal_sign(cells: Iterable[str]) -> str:

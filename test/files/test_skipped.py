@@ -283,6 +283,18 @@ def test_between_blanks_no_cell_is_empty(tmp_path, old, new, said):
         assert_same(loading.table(path, ARM, Settings()), None)
 
 
+@pytest.mark.parametrize('row', ['RMS 0.05', 'Mean 0.1 0.2 0.3', 'Std Dev 0.1'])
+@pytest.mark.parametrize('cell', ['(ok)', '[left]', 'P1'])
+def test_between_blanks_statistics_are_short_and_remarks_in_brackets(tmp_path, row, cell):
+    """The first were refused as short rows, the second read as units of the names of poses."""
+    path = tmp_path / 'cell.txt'
+    text = text_of(JOINTS, PLACES, names=NAMES, separator=' ')
+    names, *rows = text.splitlines()
+    rows = [f'P{k} {cell} {numbers}' for k, numbers in enumerate(rows)]
+    path.write_text('\n'.join([f'name state {names}', *rows, row, '']))
+    assert_same(loading.table(path, ARM, Settings()), None)
+
+
 @pytest.mark.parametrize('cell', ['---', '***', '#VALUE!', '1.#QNAN', '-nan(ind)', 'lost', 'n.a.'])
 def test_cells_without_a_value_are_empty(tmp_path, cell):
     path = tmp_path / 'cell.csv'
