@@ -21,8 +21,8 @@ from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.values import ROUNDED
 
 _MEAN = (
-    r'([^\W_]+[ _-]){0,3}(mean|average|avg|\w*mittel(wert)?|durchschnitt|ø|moy(enne)?|m[eé]dia'
-    r'|valore? medio|promedio|平均[値值]?)( value| error| of [\w ]+)?'
+    r'([^\W_]+[ _-]){0,3}(mean|average|avg|(gesamt)?mittel(wert)?|durchschnitt|ø|moy(enne)?'
+    r'|m[eé]dia|valore? medio|promedio|平均[値值]?)( value| error| of [\w ]+)?'
 )
 _OTHERS = (
     r'median|max|maximum|m[aá](ss|x)imo|min|minimum|m[ií]nimo|range|spannweite|sum|(sub)?total'

@@ -40,6 +40,7 @@ def tables(path):
         ('平均値,0.1,0.2,0.3,0.4,0.5', '標準偏差,1,1,1,1,1'),
         ('Mean error [mm],0.1,0.2,0.3,0.4,0.5', 'RMS error (mm),1,1,1,1,1'),
         ('Group 1 Average,0.1,0.2,0.3,0.4,0.5',),
+        ('Gesamtmittelwert,0.1,0.2,0.3,0.4,0.5',),
         ('Durchschnitt,0.1,0.2,0.3,0.4,0.5', 'Streuung,1,1,1,1,1', '2\u03c3,1,1,1,1,1'),
         ('Moyenne,0.1,0.2,0.3,0.4,0.5', 'Déviation standard,1,1,1,1,1'),
         ('Valor medio,0.1,0.2,0.3,0.4,0.5', 'Desviación estándar,1,1,1,1,1', 'Máximo,1,1,1,1,1'),
@@ -120,6 +121,7 @@ def test_means_between_poses_are_no_poses(tmp_path, place):
         ('std', 'alt', 'alt'),
         ('average speed', 'p'),
         ('P1 mean', 'P2 mean', 'P3 mean'),
+        ('Schmiermittel', 'dry', 'wet'),
     ],
 )
 def test_poses_with_such_names_are_kept(tmp_path, names):
