@@ -71,7 +71,9 @@ def _formulas(packed: zipfile.ZipFile) -> bool | None:
             end = b''
             while block := file.read(1 << 20):
                 if re.search(rb'<(\w+:)?f[ />]', end + block):
-                    return b'fullCalcOnLoad="1"' in packed.read('xl/workbook.xml')
+                    parts = packed.namelist()
+                    books = [part for part in parts if re.match(r'xl/workbook\d*\.xml', part)]
+                    return any(b'fullCalcOnLoad="1"' in packed.read(part) for part in books)
                 end = block[-9:]
     return None
 

@@ -36,7 +36,7 @@ def read(tmp_path):
             for name in source.namelist():
                 text = source.read(name).decode()
                 for old, new in replaced:
-                    text = text.replace(old, new)
+                    text, name = text.replace(old, new), name.replace(old, new)
                 made.writestr(name, text)
         return read_table(tmp_path / 'cell.xlsx', 2, foreign=Foreign(Layout()))
 
@@ -57,7 +57,7 @@ def test_formulas_without_values_are_told(read, replaced):
         read('=1/4', *replaced)
 
 
-@pytest.mark.parametrize('replaced', [(), (LATER,)])
+@pytest.mark.parametrize('replaced', [(), (LATER,), (('workbook.xml', 'workbook2.xml'),)])
 def test_formulas_with_values_are_read(read, replaced):
     assert_same(read('=1/4', (FORMULA, '<f>1/4</f><v>0.25</v>'), *replaced), None)
 
