@@ -32,11 +32,12 @@ UNIT = re.compile(
 UNITS_ARE = re.compile(
     r'\b(?:(?:unit[aeéà]?s?|unidade?s?|\w*einheit(?:en)?)(?: (?:of|di|de) \w+)?'
     rf'(?:\W*[:=\t]\W*({_ANY})|\W*(?:are )?(?:in )?\W?({_WORDS}))'
-    r'|(?:values|dimensions|coordinates|positions|lengths|angles|werte|angaben|längen|winkel)'
+    r'|(?:(?:\A|(?<=[^\w ])|(?<=[^\w ] )|all |the |alle |measured )(?:values|werte|angaben)'
+    r'|dimensions|coordinates|positions|lengths|angles|längen|winkel)'
     rf'\W*(?:are )?in \W?({_WORDS}))(?!\w)(?:\W+(?:and |und |et |e |y )?({_ANY})(?!\w))?',
     re.I,
 )
-"""Units in words: `Length Units = m`, `Einheiten: mm, °`, `all values are in mm`."""
+"""Units in words: `Length Units = m`, `Einheiten: mm, °`, `all values in mm`; no `sigma values`"""
 SECONDS = ('', 's', 'sec', 'second', 'seconds')
 
 SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'bar': '|', 'space': ' '}

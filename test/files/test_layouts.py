@@ -163,6 +163,7 @@ def test_a_linear_axis_has_its_own_unit_in_the_header(tmp_path):
         ('Unidad: mm\nq1 (grados),q2,x,y,z', '90,180,1,2,3'),
         ('Alle Angaben in mm\nq1 [deg],q2,x,y,z', '90,180,1,2,3'),
         ('All values are in [mm]\nq1 [deg],q2,x,y,z', '90,180,1,2,3'),
+        ('(values in mm)\nq1 [deg],q2,x,y,z', '90,180,1,2,3'),
         ('Angles in deg; lengths in mm\nq1,q2,x,y,z', '90,180,1,2,3'),
         ('Tool [mm],120,Angle [deg],,\nq1 [deg],q2,x [mm],y,z', '90,180,1,2,3'),
         ('Cell\na [deg],b,c [mm],d,e', '90,180,1,2,3'),
@@ -182,6 +183,15 @@ def test_each_column_has_its_own_unit(tmp_path, head, row):
     if 'rx' in head:
         np.testing.assert_allclose(found.rotations[0] @ [0, 1, 0], [0, 0, 1], atol=1e-9)
     assert 'no units' not in str(table.warnings)
+
+
+@pytest.mark.parametrize('words', ['Accuracy values in um', 'Sigma values are in mm'])
+def test_values_of_another_quantity_do_not_give_the_units(tmp_path, words):
+    """The coordinates were read in these."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(f'{words}\nq1,q2,x,y,z\n0,1,2,3,4\n')
+    (found,) = read_table(path, 2, foreign=Foreign(Layout())).fitted
+    assert found.positions.tolist() == [[2.0, 3.0, 4.0]]
 
 
 @pytest.mark.parametrize(
