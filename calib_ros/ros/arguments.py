@@ -146,14 +146,19 @@ def ros_arguments(given: Mapping[str, str]) -> list[str]:
     for topic in REMAPPED:
         if given.get(topic):
             words += ['-r', f'{topic}:={given[topic]}']
-    _refuse_unheard(given.get('measured_pose', ''), given.get('sources', ''))
+    _refuse_unheard(given)
     return words
 
 
-def _refuse_unheard(poses: str, sources: str) -> None:
-    listed = _value(PARAMETERS['sources'], sources)
-    names = {word.strip('/') for each in listed for word in each.split()[:1]}
-    if poses and names and names.isdisjoint(('measured_pose', poses.strip('/'))):
+def _refuse_unheard(given: Mapping[str, str]) -> None:
+    poses, above = given.get('measured_pose', ''), given.get('namespace', '')
+
+    def whole(name: str) -> str:
+        return (name if name.startswith('/') else f'{above}/{name}').strip('/')
+
+    listed = _value(PARAMETERS['sources'], given.get('sources', ''))
+    names = {whole(word) for each in listed for word in each.split()[:1]}
+    if poses and names and names.isdisjoint((whole('measured_pose'), whole(poses))):
         raise ConfigError(
             f'measured_pose:={poses} would not be heard, since sources names other topics only: '
             'name it there too'

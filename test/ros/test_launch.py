@@ -54,7 +54,7 @@ TYPED = {
 
 
 def test_every_type_arrives(launched):
-    topics = {'joint_states': '/ur/joint_states', 'measured_pose': 'left'}
+    topics = {'joint_states': '/ur/joint_states', 'measured_pose': '/left'}
     given = {name: text for name, (text, _) in TYPED.items()}
     (node,), _ = launched('calibration.launch.py', **given, **topics, namespace='cell_1')
     words = node.kwargs['ros_arguments']

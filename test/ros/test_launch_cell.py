@@ -67,6 +67,10 @@ def test_a_driver_that_no_source_hears_is_refused(launched):
         launched('cell.launch.py', sources='/wire type=Range', **given)
     actions, _ = launched('cell.launch.py', sources='measured_pose device=vicon', **given)
     assert set(nodes(actions)) == {'calibration_node', 'driver'}
+    given['namespace'] = 'cell'
+    launched('cell.launch.py', sources='/cell/measured_pose device=vicon', **given)
+    with pytest.raises(ConfigError, match='measured_pose would not be heard'):
+        launched('cell.launch.py', sources='/measured_pose device=vicon', **given)
 
 
 def test_the_chain_of_a_parameter_file_holds_beside_a_urdf(launched, tmp_path):
