@@ -40,7 +40,9 @@ NOMINAL_WORDS = _set(
     'setpoint theo theoretical ideal cad design model calc computed pred predicted sim simulated '
     'prog programmed planned tcp ee robot fk théorique teorico teórico nominale consigne'
 )
-NOMINAL_TITLES = NOMINAL_WORDS - _set('target robot tcp ee model ref reference design prog fk')
+NOMINAL_TITLES = NOMINAL_WORDS - _set(
+    'target robot tcp ee model ref reference design prog fk goal planned theo'
+)
 """Words that call the rows below a title nominal; others are of any cell."""
 TITLE_WORDS = _set(
     'value values pose poses position positions point points coordinate coordinates data table '

@@ -235,6 +235,10 @@ def test_remarks_below_names_of_poses_are_no_rows(tmp_path):
         (('Measured', 'Measured'), ''),
         (('Nominal', 'Nominal, page 2'), ''),
         (('', 'nominal speed'), ''),
+        (('', 'still at its nominal speed'), ''),
+        (('', 'goal reached'), ''),
+        (('', '# planned break'), ''),
+        (('', 'Theo'), ''),
     ],
 )
 def test_rows_below_a_title_that_calls_them_nominal_are_refused(tmp_path, titles, said, again):
