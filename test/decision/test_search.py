@@ -17,6 +17,7 @@ from calib_ros.decision.mistakes import (
     _named,
     _several,
     _suspicious,
+    _tried,
     explained,
 )
 from calib_ros.decision.undoing import Suspect
@@ -95,7 +96,7 @@ def test_positions_are_tried_alone_where_all_poses_are_whole(change, tried, monk
     tries = []
     monkeypatch.setattr(mistakes, 'in_frames', lambda *given: tries.append(given))
     seen = replace(measured_arm(1, 9)[2], **change)
-    assert _by_places(FAULTY, UR10E, (seen,), given()) is None
+    assert _by_places(FAULTY, UR10E, (seen,), given(), ()) is None
     assert bool(tries) == tried
 
 
@@ -133,8 +134,13 @@ def given(share=1.0, error=1.0):
     return SimpleNamespace(sets=(frozenset(),), share=share, error=error)
 
 
+def named(problem=FAULTY, start=None, **options):
+    start = start or given()
+    return _named(problem, start, _tried(problem, UR10E, (), start, **options))
+
+
 @pytest.mark.parametrize(
-    ('shares', 'ranks', 'named'),
+    ('shares', 'ranks', 'whats'),
     [
         ({'a': 0.1}, {}, 'a'),
         ({'a': 0.1, 'b': 0.14}, {}, 'ab'),  # as good
@@ -148,28 +154,28 @@ def given(share=1.0, error=1.0):
         ({'a': 0.14, 'b': 0.0, 'g': 0.1}, {}, 'ga'),  # b has no closed form
     ],
 )
-def test_of_equal_explanations_the_most_usual_are_named(searched, shares, ranks, named):
+def test_of_equal_explanations_the_most_usual_are_named(searched, shares, ranks, whats):
     searched([(name, ranks.get(name, 1), '') for name in 'abcdefg'], shares)
-    found = _named(FAULTY, UR10E, (), given())
-    assert ''.join(each.what for each in found.suspects if found) == named if named else not found
-    if named:
+    found = named()
+    assert ''.join(each.what for each in found.suspects if found) == whats if whats else not found
+    if whats:
         assert (found.given, found.corrected) == (1.0, min(filter(None, shares.values())))
 
 
 def test_an_explanation_leaves_a_faulty_arm_and_much_less_of_the_spread(searched):
     searched([('a', 1, '')], {'a': 0.2})
-    assert _named(FAULTY, UR10E, (), given())
-    assert _named(FAULTY, UR10E, (), given(share=2.0))
-    assert not _named(FAULTY, UR10E, (), given(share=0.6))
-    assert not _named(FAULTY, UR10E, (), given(error=0.6))
-    assert not _named(SimpleNamespace(**vars(FAULTY) | {'largest_error': 0.0}), UR10E, (), given())
+    assert named()
+    assert named(start=given(share=2.0))
+    assert not named(start=given(share=0.6))
+    assert not named(start=given(error=0.6))
+    assert not named(SimpleNamespace(**vars(FAULTY) | {'largest_error': 0.0}))
 
 
 def test_what_is_wrong_with_some_rows_is_not_the_arm(searched, monkeypatch):
     searched([], {'': 0.1})
     monkeypatch.setattr(mistakes, 'suspects', lambda *_: [Suspect('arm', 'change', chain=UR10E)])
-    assert _named(FAULTY, UR10E, (), given()).suspects[0].what == 'arm'
-    assert not _named(FAULTY, UR10E, (), given(), of_rows=True)
+    assert named().suspects[0].what == 'arm'
+    assert not named(of_rows=True)
 
 
 def test_errors_with_and_without_a_mistake_are_told_in_millimetres():
