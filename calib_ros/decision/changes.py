@@ -101,12 +101,13 @@ class Explanation(Shown):
         (change,), (sigma,) = self.change.tolist(), self.sigma.tolist()
         if self.names == (SCALE_OF_DEVICE,):
             return f'{1e6 * change:+.0f} ± {1e6 * LIKELY * sigma:.0f} ppm (95 %)'
-        return with_limits(change, sigma, self.names[0].unit)
+        return with_limits(self.names[0], change, sigma)
 
 
-def with_limits(change: float, sigma: float, unit: str) -> str:
-    """Return a change [m, rad] in thousandths, with its 95 % interval."""
-    return f'{1e3 * change:+.3f} ± {1e3 * LIKELY * sigma:.3f} m{unit} (95 %)'
+def with_limits(name: Parameter, change: float, sigma: float) -> str:
+    """Return a change of a parameter in words, with its 95 % interval."""
+    factor, unit = name.small_unit
+    return f'{factor * change:+.3f} ± {factor * LIKELY * sigma:.3f} {unit} (95 %)'
 
 
 def reason_in_words(reasons: Sequence[Explanation]) -> str:

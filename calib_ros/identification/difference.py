@@ -105,9 +105,7 @@ class Difference(Shown):
         """Return the six parameters with the largest change in sigmas, and their changes."""
         order = np.argsort(-np.abs(self.change) / self.sigma)[:6].tolist()
         names = [self.names[k] for k in order]
-        sizes = [
-            changes.with_limits(self.change[k], self.sigma[k], self.names[k].unit) for k in order
-        ]
+        sizes = [changes.with_limits(self.names[k], self.change[k], self.sigma[k]) for k in order]
         return tuple(zip(names, sizes, strict=True))
 
 

@@ -77,6 +77,13 @@ class Parameter(str):
         """Return the unit; '1' for a pure number."""
         return _unit(self)
 
+    @property
+    def small_unit(self) -> tuple[float, str]:
+        """Return factor and unit in which errors are shown: thousandths, except of lenses."""
+        if self.of_lens:
+            return 1.0, self.unit
+        return 1e3, '‰' if self.unit == '1' else f'm{self.unit}'
+
 
 @lru_cache(maxsize=1024)
 def _unit(name: Parameter) -> str:

@@ -341,7 +341,7 @@ def _parameters(result: Identification) -> Section:
     listed = [p for p in result.parameters if group_of(p.name) != 'gear']
     unlisted = len(result.parameters) - len(listed)
     for p in listed:
-        scale, small = words.small_unit(p.name)
+        scale, small = p.name.small_unit
         unit = p.name.unit.removeprefix('1')  # a pure number has none
         placed = p.std is None or result.chain.owns_frame(p.name)
         found = (None if placed else p.offset, p.std, p.half_width())

@@ -323,14 +323,8 @@ def priors_in_words(result: Identification) -> list[str]:
 
 
 def _in_thousandths(name: str, sigma: float) -> str:
-    scale, unit = small_unit(Parameter(name))
+    scale, unit = Parameter(name).small_unit
     return f'{scale * sigma:.3g} {unit}'
-
-
-def small_unit(parameter: Parameter) -> tuple[float, str]:
-    """Return factor and unit in which errors are shown: thousandths, except of lenses."""
-    unit = parameter.unit
-    return (1.0, unit) if parameter.of_lens else (1e3, '‰' if unit == '1' else f'm{unit}')
 
 
 def cameras_in_words(result: Identification) -> list[str]:
