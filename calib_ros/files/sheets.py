@@ -223,7 +223,8 @@ def _narrow(text: str, separator: str) -> str:
         return text
     text = re.sub(r'[ \t]+', ' ', re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text))
     words = r'(?m)^(?!(?:.* )?[-+.\d]+(?:e\S+)?(?: |$)).*[\[(].*'
-    before = re.compile(r'(?<=\w) (?=[\[(](?:[^\W\d]{1,12}|[°º])[\])])')  # q1 [deg]
+    # q1 [deg], but no line of units: unit [deg] [deg]
+    before = re.compile(r'(?<=\w) (?=[\[(](?:[^\W\d]{1,12}|[°º])[\])](?! [\[(]))')
     return re.sub(words, lambda line: before.sub('', line[0]), text)
 
 

@@ -301,6 +301,15 @@ def test_between_blanks_statistics_are_short_and_remarks_in_brackets(tmp_path, r
     assert_same(loading.table(path, ARM, Settings()), None)
 
 
+def test_between_blanks_a_line_of_units_has_a_cell_for_each_name(tmp_path):
+    """Its first one became one cell with the word before it, and the others moved."""
+    path = tmp_path / 'cell.txt'
+    names, *rows = text_of(JOINTS, PLACES, names=NAMES, separator=' ').splitlines()
+    rows = [f'P{k} {numbers}' for k, numbers in enumerate(rows)]
+    path.write_text('\n'.join([f'name {names}', 'unit (rad) (rad) (m) (m) (m)', *rows, '']))
+    assert_same(loading.table(path, ARM, Settings()), None)
+
+
 @pytest.mark.parametrize('cell', ['---', '***', '#VALUE!', '1.#QNAN', '-nan(ind)', 'lost', 'n.a.'])
 def test_cells_without_a_value_are_empty(tmp_path, cell):
     path = tmp_path / 'cell.csv'
