@@ -74,12 +74,15 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
                 )
             raise UnknownNameError('robot', str(name_or_path), robots, another)
         path = robots[name]
-    elif path.suffix.lower() not in ('', '.yaml', '.yml'):
+    try:
+        chain = parse_chain(chain_text(path), str(path))
+    except ConfigError as err:
+        if path.suffix.lower() in ('', '.yaml', '.yml', '.json') or not path.is_file():
+            raise
         raise ConfigError(
             f'{path} is no chain file (.yaml) or URDF: give the arm, by its file or name, as '
             '--chain, and measurements without an option'
-        )
-    chain = parse_chain(chain_text(path), str(path))
+        ) from err
     _refuse_other_units(chain, str(path))
     return chain
 

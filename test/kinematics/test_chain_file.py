@@ -263,7 +263,7 @@ def test_an_unknown_robot_lists_those_there_are():
 
 
 def test_a_chain_file_is_read_by_its_path(tmp_path):
-    for name in ('cell.yaml', 'ur10e'):  # a file goes before a robot of the same name
+    for name in ('cell.yaml', 'cell.yaml.orig', 'cell.json', 'ur10e'):  # before a robot's name
         path = tmp_path / name
         path.write_text(UR)
         assert load_chain(path).name == 'some_ur'
