@@ -161,7 +161,10 @@ def read_poses(path: Path) -> FloatArray:
     told = {column: name_and_unit(column)[1] for column in columns[:3]}
     for column, unit in told.items():
         if unit not in (LENGTHS if any(told.values()) else ('',)):
-            raise InputError(f'{path}: {column} must be in {" or ".join(LENGTHS)}, as x, y and z')
+            raise InputError(
+                f'{path}: {column} names no unit of length ({", ".join(LENGTHS)}): name one in '
+                'each of x, y and z, or in none for m'
+            )
     numbers[:, :3] *= [LENGTHS.get(unit, 1.0) for unit in told.values()]
     check_quaternions(found, numbers[:, 3:])
     return se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
