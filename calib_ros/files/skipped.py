@@ -21,7 +21,8 @@ from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.values import ROUNDED
 
 _MEAN = (
-    r'([^\W_]+[ _-]){0,3}(mean|average|avg|(gesamt)?mittel(wert)?|durchschnitt|ø|moy(enne)?'
+    r'((?!(?:than|the|above|below)\b)[^\W_]+[ _-]){0,3}'  # Group 1, but no remark
+    r'(mean|average|avg|(gesamt)?mittel(wert)?|durchschnitt|ø|moy(enne)?'
     r'|m[eé]dia|valore? medio|promedio|平均[値值]?)( value| error| of [\w ]+)?'
 )
 _OTHERS = (

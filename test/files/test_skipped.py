@@ -122,6 +122,9 @@ def test_means_between_poses_are_no_poses(tmp_path, place):
         ('average speed', 'p'),
         ('P1 mean', 'P2 mean', 'P3 mean'),
         ('Schmiermittel', 'dry', 'wet'),
+        ('better than average', 'p'),
+        ('above average', 'p'),
+        ('taken as the mean', 'p'),
     ],
 )
 def test_poses_with_such_names_are_kept(tmp_path, names):
