@@ -279,7 +279,7 @@ def test_a_record_in_another_convention_is_taken_as_it_is():
     found = parse_calibration(calibrated_text(UR, record), 'c.yaml', UR)
     assert found.record == record
     assert found.chain.joint_names == UR.joint_names
-    with pytest.raises(ConfigError, match='give that with --chain'):
+    with pytest.raises(ConfigError, match=r'that chain \(--chain\)'):
         parse_calibration(calibrated_text(UR, record), 'c.yaml')
 
 
