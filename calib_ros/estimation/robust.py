@@ -63,7 +63,7 @@ class Robust:
     @property
     def good(self) -> tuple[Flags, ...]:
         """Return which samples (N,) of each set are no gross errors."""
-        return tuple(each <= OUTLIER for each in self.distances)
+        return tuple((each <= OUTLIER) | (self.loss == 'none') for each in self.distances)
 
     @property
     def outliers(self) -> Flags:
@@ -86,29 +86,33 @@ def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) 
     second = reweighted(trimmed_start(chain, names, system), names, system, loss)
     sums = [trimmed_sum(robust.fit.chain, system) for robust in (first, second)]
     another = sums[0] > ALIKE**2 * sums[1]
-    if another and _chance(names, system, first, second) < 1.0 - SURE:
+    spare = system.rows - unknown(names, system)
+    if another and chance_of_outliers(second, first.fit.chain, names, system, spare) < 1.0 - SURE:
         return second
     return first
 
 
-def _chance(names: Sequence[str], system: System, first: Robust, second: Robust) -> float:
+def chance_of_outliers(
+    robust: Robust, near: Chain, names: Sequence[str], system: System, spare: int
+) -> float:
     """Return the probability that a fit leaves so many samples out by chance, at most.
 
     The F test of a shift of each of them (Cook and Weisberg 1982), times the number of ways to
-    choose them, with a tail bound (Chernoff 1952), because it may underflow.
+    choose them, with a tail bound (Chernoff 1952), because it may underflow. The fit to all, found
+    from a chain `near` it, has `spare` equations beyond those that the parameters take.
     """
-    out = int(second.outliers.sum())
+    out = int(robust.outliers.sum())
     if not out:
         return 0.0
-    least = minimise(first.fit.chain, names, system, tolerance=1e-3).normal.cost
-    share = second.fit.normal.cost / max(least, 1e-300)
+    least = minimise(near, names, system, tolerance=1e-3).normal.cost
+    share = robust.fit.normal.cost / max(least, 1e-300)
     shifts = 0.5 * system.rows * out / system.count
-    spare = 0.5 * (system.rows - unknown(names, system)) - shifts
-    if spare <= 0.0 or share >= spare / (spare + shifts):
+    left = 0.5 * spare - shifts
+    if left <= 0.0 or share >= left / (left + shifts):
         return 1.0
-    mean = spare / (spare + shifts)
+    mean = left / (left + shifts)
     ways = -special.betaln(out + 1.0, system.count - out + 1.0) - np.log(system.count + 1.0)
-    tail = spare * np.log(max(share, 1e-300) / mean)
+    tail = left * np.log(max(share, 1e-300) / mean)
     tail += shifts * np.log((1.0 - share) / (1.0 - mean))
     return float(np.exp(min(tail + ways, 0.0)))
 
