@@ -38,6 +38,11 @@ MEAN, STATISTIC = (
     for names in (_MEAN, f'{_MEAN}|{_OTHERS}')
 )
 """Names of rows that hold no pose, and of those that may hold one."""
+LEVEL = re.compile(
+    rf'{BETWEEN}(low|high|slow|fast|alt[ao]|baj[ao]|bass[ao]|baix[ao]|lent[ao]|r[áa]pid[ao])'
+    rf'(?={BETWEEN}|\Z)'
+)
+"""What stands beside `media` if it is a speed or load of poses."""
 Statistic: TypeAlias = Callable[[FloatArray], FloatArray]  # (C,) of columns (N, C)
 MOMENTS: tuple[Statistic, ...] = (
     lambda columns: columns.mean(axis=0),
@@ -171,6 +176,8 @@ def without_statistics(columns: Columns) -> tuple[Columns, tuple[str, ...]]:
     kept = np.ones(len(columns.lines), dtype=bool)
     for text in map(str, columns.cells.values()):  # as read: text of many rows
         if not STATISTIC.search(text[: 100 * MOST_ENTRIES] + BETWEEN + text[-10 * LONGEST :]):
+            continue
+        if LEVEL.search(f'{BETWEEN}{text}'.lower()):
             continue
         cells = text.lower().split(BETWEEN)
         times, named = Counter(cells), [STATISTIC.match(cell) is not None for cell in cells]

@@ -125,6 +125,8 @@ def test_means_between_poses_are_no_poses(tmp_path, place):
         ('better than average', 'p'),
         ('above average', 'p'),
         ('taken as the mean', 'p'),
+        ('low', 'media', 'high'),
+        ('alta', 'media', 'bassa'),
     ],
 )
 def test_poses_with_such_names_are_kept(tmp_path, names):
