@@ -188,7 +188,7 @@ def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> st
     prismatic move along it.
     """
     form = converted(replace(chain, base=Frame(), tool=Frame()), 'modified')
-    names = (*chain.joint_names, 'flange')
+    names = (*chain.joint_names, _flange(chain))
     poses = {name: xyz_rpy(place) for name, place in zip(names, origins(form), strict=True)}
     signs = {joint.name: joint.sign for joint in form.joints}
     document: dict[str, Any] = {'kinematics': poses, 'signs': signs}
@@ -217,8 +217,13 @@ def forward_of(text: str, chain: Chain, q: FloatArray) -> FloatArray:
     slides = [name in document.get('prismatic', ()) for name in chain.joint_names]
     values = chain.effective(q.T).T
     moved = walked(places, values * [signs[name] for name in chain.joint_names], slides)
-    end = pose_matrix(poses['flange']) @ chain.frame('tool').matrix
+    end = pose_matrix(poses[_flange(chain)]) @ chain.frame('tool').matrix
     return np.asarray(chain.frame('base').matrix @ moved @ end)
+
+
+def _flange(chain: Chain) -> str:
+    """Return the name of the last frame, which no joint may have."""
+    return 'flange' + '_' * ('flange' in chain.joint_names)
 
 
 def walked(
@@ -263,9 +268,10 @@ def head(chain: Chain, what: str, error: float, elsewhere: str = '') -> str:
 
 
 def urdf_export(name: str, urdf: str, chain: Chain, links: Mapping[str, str | None]) -> Export:
-    """Return a corrected URDF; the comment at its end identifies it."""
-    urdf = re.sub('<!-- calibrated table [0-9a-f]* -->\n', '', urdf)  # corrected before
-    foot = f'<!-- calibrated table {table_hash(chain)} -->\n'
+    """Return a corrected URDF; a comment at its end identifies each arm by its last joint."""
+    arm = re.sub(r'\W', '_', chain.joint_names[-1])  # as a comment may hold it
+    urdf = re.sub(f'<!-- calibrated table [0-9a-f]* of {arm} -->\n', '', urdf)  # corrected before
+    foot = f'<!-- calibrated table {table_hash(chain)} of {arm} -->\n'
     return Export(name, corrected_urdf(urdf, chain, **links) + foot, 0.0)
 
 

@@ -30,6 +30,7 @@ from calib_ros.kinematics.chain_file import (
     table_hash,
 )
 from calib_ros.kinematics.parameter import DH_KINDS
+from calib_ros.kinematics.urdf import chain_from_urdf
 
 KEYS = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
 ROBOTS = sorted(shipped_robots())
@@ -267,7 +268,25 @@ def test_a_urdf_corrected_again_names_only_its_own_table():
     first = urdf_export('a.urdf', UR10E, once, {}).content
     again = urdf_export('b.urdf', first, twice, {}).content
     assert again == urdf_export('b.urdf', UR10E, twice, {}).content
-    assert re.findall('calibrated table (.*) -->', again) == [table_hash(twice)]
+    assert re.findall('calibrated table (.*) of', again) == [table_hash(twice)]
+
+
+def test_a_urdf_names_the_tables_of_both_its_arms():
+    """The second correction took the first one's out."""
+    first = urdf_export('a.urdf', UR10E, load_chain('ur10e'), {}).content
+    earlier = first.splitlines(keepends=True)[-1]
+    other = re.sub('(?<=name=")(?=[^"]*_joint)', 'l_', UR10E) + earlier
+    assert earlier in urdf_export('b.urdf', other, chain_from_urdf(other), {}).content
+
+
+def test_a_joint_may_be_called_flange():
+    """Its pose was replaced by that of the last frame, and nothing was exported."""
+    chain = load_chain('ur10e')
+    last = replace(chain.joints[-1], name='flange')
+    named = replace(chain, joints=(*chain.joints[:-1], last))
+    by_name = {each.name: each for each in exports(named, named)}
+    poses = yaml.safe_load(by_name['kinematics.yaml'].content)['kinematics']
+    assert [*poses][-2:] == ['flange', 'flange_']
 
 
 @pytest.fixture
