@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 
 import numpy as np
 
@@ -48,7 +49,7 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     try:
         table = loading.table(options.csv, chain, Settings(), common.sessions_of(options))
     except CalibrationError as err:
-        if '--' in (told := str(err)):
+        if re.search('--(?!chain|session)[a-z]', told := str(err)):  # no cell of a table
             told += '; these are options of calib_ros import, whose table csv2bag takes'
         raise InputError(told) from err
     for warning in table.warnings:

@@ -155,6 +155,12 @@ def test_a_bag_is_made_of_any_table_that_identify_reads(run, tmp_path, name):
         np.testing.assert_allclose(first.positions[0], [1e-3, 2.5e-3, 3e-3], atol=1e-9)
 
 
+def test_two_dashes_in_a_table_are_no_option(run, tmp_path):
+    (tmp_path / 'table.csv').write_text('q1,q2,q3,q4,q5,q6,x,y,z\n0,0,0,0,0,0,--,2,3\n')
+    status, _, err = run('csv2bag', 'table.csv', 'bag', '--chain', 'ur5e')
+    assert (status, 'calib_ros import' in err) == (1, False)
+
+
 def test_a_simulation_is_repeated_by_its_seed(run, tmp_path):
     truths = {}
     for name, seed in (('a', 1), ('b', 1), ('c', 2)):
