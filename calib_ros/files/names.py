@@ -23,6 +23,7 @@ WORD = re.compile(r'[^\W\d_A-Z]+|[A-Z][^\W\d_A-Z]+|[A-Z]+(?![a-z])|[0-9]+')
 CORNER = re.compile(r'(\D*)([01])(\D*)\2(\D*)')
 """The name of the first number of a matrix."""
 SECOND_NAMES = re.compile(r'q[0-9]+[._ (]+[0-9]\)?', re.I)  # q1.1, as pandas names a second q1
+SECOND_ARM = re.compile(r'q[2-9][._ (]+\*')
 PLAIN = re.compile(r'#[\d*]+|[^\W\d][\w*]*(\.[\w*]+)*')
 """Names that --columns takes without braces."""
 
@@ -166,9 +167,11 @@ def in_doubt(header: Sequence[str], plain: Sequence[str], joints: int = 0) -> st
             f'{option(POSITION, plain)} if they were measured'
         )
     again = [name for name in header if _rank(name) < 0 or SECOND_NAMES.fullmatch(name)]
-    if joints and (like := like_joints(again, joints)):
+    like = like_joints(again, joints) if joints else {}
+    first = next(iter(like.values()), '')
+    if first and not SECOND_ARM.match(first):
         return (
-            f'q1 may be commanded beside {next(iter(like.values())).replace("*", "1")}: give '
+            f'q1 may be commanded beside {first.replace("*", "1")}: give '
             f'{option(like, like.values())}, or --columns "q*=q*" if it was measured'
         )
     return ''

@@ -167,6 +167,13 @@ def test_joints_by_their_names_are_not_mixed_with_ours(tmp_path):
     assert 'columns not read: q1 (' in str(table.warnings)
 
 
+def test_joints_of_a_second_arm_are_not_taken_for_measured_ones(tmp_path):
+    """They were asked for in place of q1 and q2."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(text_of(JOINTS, PLACES, JOINTS, names=[*NAMES, 'q2_1', 'q2_2']))
+    assert_same(loading.table(path, ARM, Settings()), None)
+
+
 @pytest.mark.parametrize('form', ['joint{}_speed', 'J{}_torque', 'A{}_power', 'q{}_act_current'])
 def test_other_values_are_never_proposed_for_joints(tmp_path, form):
     path = tmp_path / 'cell.csv'
