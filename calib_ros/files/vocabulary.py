@@ -31,13 +31,17 @@ UNIT = re.compile(
 """A name with its unit: X [mm], X (mm), X / mm, X_mm, X-mm; brackets may hold something else."""
 UNITS_ARE = re.compile(
     r'\b(?:(?:unit[aeéà]?s?|unidade?s?|\w*einheit(?:en)?)(?: (?:of|di|de) \w+)?'
-    rf'(?:\W*[:=\t]\W*({_ANY})|\W*(?:are )?(?:in )?\W?({_WORDS}))'
+    rf'(?:\W*[:=\t]\W*(?:in \W?(?=(?:{_ANY})(?!\w)))?'
+    rf'(?!in (?!(?:and|und|et|e|y)\b)[^\W\d])({_ANY})|\W*(?:are )?(?:in )?\W?({_WORDS}))'
     r'|(?:(?:\A|(?<=[^\w ])|(?<=[^\w ] )|all |the |alle |measured )(?:values|werte|angaben)'
     r'|dimensions|coordinates|positions|lengths|angles|längen|winkel)'
     rf'\W*(?:are )?in \W?({_WORDS}))(?!\w)(?:\W+(?:and |und |et |e |y )?({_ANY})(?!\w))?',
     re.I,
 )
-"""Units in words: `Length Units = m`, `Einheiten: mm, °`, `all values in mm`; no `sigma values`"""
+"""Units in words: `Length Units = m`, `Einheiten: mm, °`, `all values in mm`.
+
+Not `sigma values in mm`, nor `Unit: in Stuttgart`.
+"""
 SECONDS = ('', 's', 'sec', 'second', 'seconds')
 
 SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'bar': '|', 'space': ' '}

@@ -161,6 +161,7 @@ def test_a_linear_axis_has_its_own_unit_in_the_header(tmp_path):
         ('Unité : mm et degrés\nq1,q2,x,y,z', '90,180,1,2,3'),
         ('Unità di misura: mm\nq1 [gradi],q2,x,y,z', '90,180,1,2,3'),
         ('Unidad: mm\nq1 (grados),q2,x,y,z', '90,180,1,2,3'),
+        ('Units: in mm, deg\nq1,q2,x,y,z', '90,180,1,2,3'),
         ('Alle Angaben in mm\nq1 [deg],q2,x,y,z', '90,180,1,2,3'),
         ('All values are in [mm]\nq1 [deg],q2,x,y,z', '90,180,1,2,3'),
         ('(values in mm)\nq1 [deg],q2,x,y,z', '90,180,1,2,3'),
@@ -185,7 +186,9 @@ def test_each_column_has_its_own_unit(tmp_path, head, row):
     assert 'no units' not in str(table.warnings)
 
 
-@pytest.mark.parametrize('words', ['Accuracy values in um', 'Sigma values are in mm'])
+@pytest.mark.parametrize(
+    'words', ['Accuracy values in um', 'Sigma values are in mm', 'Unit: in Stuttgart']
+)
 def test_values_of_another_quantity_do_not_give_the_units(tmp_path, words):
     """The coordinates were read in these."""
     path = tmp_path / 'cell.csv'
