@@ -310,7 +310,8 @@ def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
         if kind != same:
             continue
         ours, others = Counter(named), Counter(logged)
-        often = min(ours.values()) > 1 and 2 * len(ours) >= len(logged)  # each pose
+        again = sum(count for count in ours.values() if count > 1)
+        often = 2 * again >= len(named) and (not kind or 2 * len(ours) >= len(logged))
         wrong = [cell for cell in named if others[cell] != 1 or not (often or ours[cell] == 1)]
         if not wrong:
             rows = {cell: row for row, cell in enumerate(logged)}
