@@ -10,8 +10,10 @@ from pathlib import Path
 from calib_ros.errors import LONGEST, ColumnsError, InputError, shortened
 from calib_ros.files.names import (
     MEASURED_WORDS,
+    NO_PLACE,
     NOMINAL_WORDS,
     distance_in,
+    groups,
     like_joints,
     matrix_in,
     named_in,
@@ -32,6 +34,9 @@ from calib_ros.files.vocabulary import (
     joint_columns,
 )
 from calib_ros.shown import some
+
+SEVERAL_POINTS = '; of several points give one, or a row for each, named in a column target'
+ELSEWHERE = '; are they in another file or sheet? Give that one, and this as --joints'
 
 
 def name_and_unit(cell: str) -> tuple[str, str]:
@@ -137,7 +142,8 @@ def named_by_option(
         elif other := matrix_in(header) or distance_in(header):
             found = {n: each for n, each in found.items() if n not in POSITION} | other
         elif joints and not lacking:
-            more = '; are they in another file or sheet? Give that one, and this as --joints'
+            several = len(groups(header, POSITION, without=NO_PLACE)) > 1
+            more = SEVERAL_POINTS if several else ELSEWHERE
     # X_in is not read as a unit
     if (unit := words_of(found.get('x', ''))[1:]) in (['m'], ['in'], ['ft']):
         more = f' --length {unit[0]}{more}'

@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import accumulate, chain, zip_longest
+from itertools import accumulate, chain, islice, zip_longest
 from pathlib import Path
 
 from calib_ros.errors import MOST_ENTRIES, InputError
@@ -31,6 +31,7 @@ from calib_ros.files.skipped import refuse_nominal, without_statistics, without_
 from calib_ros.files.vocabulary import (
     DECIMAL_COMMA,
     MISSING,
+    POSITION,
     SEPARATORS,
     SHEETS,
     THOUSANDS,
@@ -340,6 +341,13 @@ def _header(
             numbered = [cells[int(n[1:]) - 1] for n in names if int(n[1:]) <= len(cells)]
             of_data = any(_is_number(cell, ',') for cell in numbered)
             return (-1, ()) if of_data else (k, tuple(cells))
+    for column in islice(zip_longest(*(cells for _, cells in rows), fillvalue=''), 9):
+        if {*POSITION} <= {name_and_unit(cell)[0].lower() for cell in column}:
+            raise InputError(
+                f'{path} has x, y, z below each other, expected a row for each pose, with all its '
+                'coordinates in columns of their own: exchange rows and columns (in a spreadsheet '
+                'program: paste transposed), or export one line for each point'
+            )
     return (-1, ()) if names else (at, tuple(rows[at][1]))
 
 

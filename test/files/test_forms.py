@@ -51,6 +51,22 @@ def test_a_table_in_another_form_is_the_same(tmp_path, form):
     assert_same(loading.table(path, ARM, Settings()), None)
 
 
+@pytest.mark.parametrize(
+    'text',
+    [
+        'Name,Axis,Nom,Meas\n' + ''.join(f'P{k},{a},1,{k}\n' for k in '12' for a in 'XYZ'),
+        'Pose;P1;P2\nq1 [deg];1;2\nq2;3;4\nx [mm];1,5;2\ny [mm];2;3\nz [mm];3;4\n',
+        'q1,1,2\nq2,3,4\nx,1,2\ny,2,3\nz,3,4\n',
+    ],
+)
+def test_coordinates_below_each_other_are_refused(tmp_path, text):
+    """With a word on that; options for columns of these names were proposed."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(text)
+    with pytest.raises(InputError, match='has x, y, z below each other, expected a row for each'):
+        loading.table(path, ARM, Settings())
+
+
 def test_rows_that_name_the_joints_are_no_header_of_numbered_columns(tmp_path):
     """As ros2 topic echo --csv writes joint states; the first row was lost."""
     path, log = tmp_path / 'p.csv', tmp_path / 'js.csv'

@@ -106,12 +106,16 @@ def test_what_is_no_expression(text):
             ['q1', 'q2', 'Date', 'Load', 'Note'],
             'are they in another file or sheet? Give that one, and this as --joints',
         ),
+        (
+            ['q1', 'q2', *(f'{a}{k}' for k in (1, 2) for a in 'xyz')],
+            'of several points give one, or a row for each, named in a column target',
+        ),
         (['0.1', '-2', '3', '4e-5', '5'], '--columns "q1=#1,q2=#2,x=#3,y=#4,z=#5", in its order'),
     ],
 )
 def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, names, proposed):
     path = tmp_path / 'cell.csv'
-    path.write_text(text_of(JOINTS, PLACES, names=names))
+    path.write_text(text_of(JOINTS, *[PLACES] * ((len(names) - 2) // 3), names=names))
     joints = tuple(Joint(name, a=0.3) for name in ('shoulder', 'elbow'))
     with pytest.raises(InputError) as told:
         loading.table(path, Chain('arm', 'standard', joints), Settings())
@@ -280,6 +284,8 @@ def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_h
         ('Point,x,y,z\nP1.1,2,0,0\nP11,1,0,0\n', 'Position,q1\nP1.1,2\nP11,1\n', ''),
         ('No,At,x,y,z\n1,a,1,0,0\n2,b,2,0,0\n', 'No,At,q1\n1,b,2\n2,a,1\n', ''),
         ('Target,x,y,z\na,1,0,0\nb,2,0,0\na,1,0,0\nb,2,0,0\n', 'At,q1\nb,2\na,1\n', ''),
+        ('Point,x,y,z\na,1,0,0\na,1,0,0\nb,2,0,0\n', 'At,q1\nb,2\nc,9\na,1\n', ''),
+        ('Point,x,y,z\n' + 'a,1,0,0\n' * 4, 'At,q1\nb,2\nc,9\na,1\nd,8\n', ''),
         (
             'No,At,x,y,z\n1,a,1,0,0\n2,b,2,0,0\n3,c,3,0,0\n',
             'No,At,q1\n1,a,1\n2,b,2\n3,d,3\n',
