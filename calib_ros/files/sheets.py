@@ -113,8 +113,8 @@ def _of_text(path: Path, layout: Layout) -> _Content:
     if layout.comment:
         comment = re.compile(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$')
         comments, text = comment.findall(text), comment.sub('', text)
-    # a header, as numpy and SpatialAnalyzer write it
-    text = re.sub(r'(?m)^(?:[#%]+[ \t]+|//[ \t]*)(?=[A-Za-z])', '', text)
+    # a header, as numpy and SpatialAnalyzer write it; before a tab it is a name
+    text = re.sub(r'(?m)^(?:[#%]+ +|//[ \t]*)(?=[A-Za-z])', '', text)
     if text.startswith('"') and not re.search(r'(?m)^(?!"[^"\n]*"$)[^\n]', text):  # one cell each
         text = re.sub('(?m)^"|"$', '', text)
         notes.append('whole lines are in quotation marks: read without them')
@@ -166,7 +166,7 @@ def _sheet(
     body = without_words(chain([whole[first:]], rows), again, left)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
     if at >= 0 and max(used, default=0) < len(header):
-        _refuse_shifted(columns, len(header))
+        _refuse_shifted(columns, len(header), content.blanks)
     if content.blanks:
         refuse_short(columns, f'#{len(header)}')
     refuse_nominal(columns, [*above, *left])
@@ -178,13 +178,19 @@ def _sheet(
     return Sheet(path, header, words, replace(columns, decimal=decimal), tuple(notes))
 
 
-def _refuse_shifted(columns: Columns, width: int) -> None:
-    """Refuse a row with a number more than a header of so many names; a remark there is text."""
+def _refuse_shifted(columns: Columns, width: int, blanks: bool) -> None:
+    """Refuse a row with a number more than a header of so many names; a remark there is text.
+
+    Between blanks, text in all rows is a column: `# q1 q2` may begin with its name.
+    """
     for name in columns.header[width : width + 1]:
-        for line, cell in zip(columns.lines.tolist(), columns.texts(name), strict=True):
-            if _is_number(cell, ','):
+        texts = columns.texts(name)
+        whole = blanks and '' not in texts
+        told = 'cells' if whole else 'numbers'
+        for line, cell in zip(columns.lines.tolist(), texts, strict=True):
+            if whole or _is_number(cell, ','):
                 raise InputError(
-                    f'{columns.path}, line {line}: more numbers than the {width} columns of its '
+                    f'{columns.path}, line {line}: more {told} than the {width} columns of its '
                     'header: name each column there; a doubled separator, a thousands mark or a '
                     'decimal comma also makes one more'
                 )

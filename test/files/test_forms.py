@@ -39,6 +39,9 @@ FORMS = {
     'exponents of Fortran': PLAIN.replace('0.25', '2.5D-01'),
     'decimal commas in quotes': re.sub('[^,\n]+', r'"\g<0>"', PLAIN).replace('.', ','),
     'a header in quotes': PLAIN.replace('q1', '"q1"').replace(',', ';'),
+    'a column called #': re.sub(
+        '(?m)(?<=.)$', '\tok', '#\t' + PLAIN.replace('\n', '\n1\t', 3)
+    ).replace(',', '\t'),
     'other separators in quotes': 'note,' + PLAIN.replace('\n', '\n"a; b; c; d; e; f, g",', 3),
 }
 
@@ -257,6 +260,14 @@ def test_rows_with_a_number_more_than_the_header_are_refused(tmp_path, rows, lin
         return
     with pytest.raises(InputError, match=f'line {line}: more numbers than the 5 columns'):
         read_table(path, 2, foreign=Foreign(Layout()))
+
+
+def test_a_header_that_may_lack_the_name_of_a_column_is_refused(tmp_path):
+    """The numbers of the poses were q1, and so on, behind a header like those of numpy."""
+    path = tmp_path / 'cell.txt'
+    path.write_text('# q1 q2 x y z\n1 2 3 4 5 ok\n2 2 3 4 6 ok\n')
+    with pytest.raises(InputError, match='line 2: more cells than the 5 columns of its header'):
+        loading.table(path, ARM, Settings())
 
 
 @pytest.mark.parametrize(
