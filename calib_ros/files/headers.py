@@ -36,7 +36,7 @@ from calib_ros.files.vocabulary import (
 from calib_ros.shown import some
 
 SEVERAL_POINTS = '; of several points give one, or a row for each, named in a column target'
-ELSEWHERE = '; are they in another file or sheet? Give that one, and this as --joints'
+IN_ANOTHER_TABLE = '; are they in another file or sheet? Give that one, and this as --joints'
 
 
 def name_and_unit(cell: str) -> tuple[str, str]:
@@ -142,8 +142,8 @@ def named_by_option(
         elif other := matrix_in(header) or distance_in(header):
             found = {n: each for n, each in found.items() if n not in POSITION} | other
         elif joints and not lacking:
-            several = len(groups(header, POSITION, without=NO_PLACE)) > 1
-            more = SEVERAL_POINTS if several else ELSEWHERE
+            points = len(groups(header, POSITION, without=NO_PLACE))
+            more = SEVERAL_POINTS if points > 1 else IN_ANOTHER_TABLE
     # X_in is not read as a unit
     if (unit := words_of(found.get('x', ''))[1:]) in (['m'], ['in'], ['ft']):
         more = f' --length {unit[0]}{more}'

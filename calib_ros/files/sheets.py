@@ -158,7 +158,9 @@ def _sheet(
     first = _first(path, head, at, used, decimal, notes)
     if at < 0:  # columns by their numbers
         header = tuple(f'#{k + 1}' for k in range(len(head[first][1])))
-    of_groups = [_over_groups(cells, len(header)) for _, cells in head[: max(at, 0)][-1:]]
+    over = [cells for _, cells in head[: max(at, 0)][-1:]]
+    over = [cells for cells in over if not content.blanks or len(cells) == len(header)]
+    of_groups = [_over_groups(cells, len(header)) for cells in over]
     header = _with_units(header, [*(cells for _, cells in head[at + 1 : first]), *of_groups])
     above = head[: first if at < 0 else at]
     left: list[Cells] = []
@@ -166,7 +168,7 @@ def _sheet(
     body = without_words(chain([whole[first:]], rows), again, left)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
     if at >= 0 and max(used, default=0) < len(header):
-        _refuse_shifted(columns, len(header), content.blanks)
+        _refuse_shifted(columns, len(header))
     if content.blanks:
         refuse_short(columns, f'#{len(header)}')
     refuse_nominal(columns, [*above, *left])
@@ -174,23 +176,23 @@ def _sheet(
         without = lines_in_words([line for line, _ in left])
         notes.append(f'there are no numbers in {without}: skipped')
     header = (*header, *[''] * (len(columns.header) - len(header)))
-    words = (*content.comments, *('\t'.join(cells) for _, cells in (*above, *left)))
+    between = ' ' if content.blanks else '\t'
+    words = (*content.comments, *(between.join(cells) for _, cells in (*above, *left)))
     return Sheet(path, header, words, replace(columns, decimal=decimal), tuple(notes))
 
 
-def _refuse_shifted(columns: Columns, width: int, blanks: bool) -> None:
+def _refuse_shifted(columns: Columns, width: int) -> None:
     """Refuse a row with a number more than a header of so many names; a remark there is text.
 
-    Between blanks, text in all rows is a column: `# q1 q2` may begin with its name.
+    Text in all rows is a column: a decimal comma may have made it, or `# q1 q2` have its name.
     """
     for name in columns.header[width : width + 1]:
         texts = columns.texts(name)
-        whole = blanks and '' not in texts
-        told = 'cells' if whole else 'numbers'
+        whole = '' not in texts
         for line, cell in zip(columns.lines.tolist(), texts, strict=True):
             if whole or _is_number(cell, ','):
                 raise InputError(
-                    f'{columns.path}, line {line}: more {told} than the {width} columns of its '
+                    f'{columns.path}, line {line}: more cells than the {width} columns of its '
                     'header: name each column there; a doubled separator, a thousands mark or a '
                     'decimal comma also makes one more'
                 )

@@ -258,16 +258,17 @@ def test_rows_with_a_number_more_than_the_header_are_refused(tmp_path, rows, lin
     if not line:
         assert len(read_table(path, 2, foreign=Foreign(Layout())).fitted[0]) == 3
         return
-    with pytest.raises(InputError, match=f'line {line}: more numbers than the 5 columns'):
+    with pytest.raises(InputError, match=f'line {line}: more cells than the 5 columns'):
         read_table(path, 2, foreign=Foreign(Layout()))
 
 
 def test_a_header_that_may_lack_the_name_of_a_column_is_refused(tmp_path):
     """The numbers of the poses were q1, and so on, behind a header like those of numpy."""
     path = tmp_path / 'cell.txt'
-    path.write_text('# q1 q2 x y z\n1 2 3 4 5 ok\n2 2 3 4 6 ok\n')
-    with pytest.raises(InputError, match='line 2: more cells than the 5 columns of its header'):
-        loading.table(path, ARM, Settings())
+    for text in ('# q1 q2 x y z\n1 2 3 4 5 ok\n2 2 3 4 6 ok\n', 'q1,q2,x,y,z\n0,2,1,2,3,ok\n'):
+        path.write_text(text)
+        with pytest.raises(InputError, match='line 2: more cells than the 5 columns of its head'):
+            loading.table(path, ARM, Settings())
 
 
 @pytest.mark.parametrize(

@@ -201,6 +201,14 @@ def test_values_of_another_quantity_do_not_give_the_units(tmp_path, words):
     assert found.positions.tolist() == [[2.0, 3.0, 4.0]]
 
 
+def test_between_blanks_words_above_the_header_are_no_units_of_columns(tmp_path):
+    """The second joint was in inches."""
+    path = tmp_path / 'cell.txt'
+    path.write_text('Values in mm\nq1 q2 x y z\n0 1 2 3 4\n')
+    (found,) = read_table(path, 2, foreign=Foreign(Layout())).fitted
+    assert found.positions.tolist() == [[2e-3, 3e-3, 4e-3]]
+
+
 @pytest.mark.parametrize(
     ('head', 'told'),
     [
