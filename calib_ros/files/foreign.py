@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import product, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +49,7 @@ from calib_ros.values import MOST_NAMES
 
 LEADING_ZEROS = re.compile('(?<![0-9.])0+(?=[0-9])')
 PARTS = re.compile(r'[^\W\d_]+|[0-9]+')
+NUMBERED = re.compile(r'\D*?0*([0-9]+)(?:\.0*)?\D*')
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,6 +276,15 @@ class _Table:
                     bare = ['.'.join(PARTS.findall(cell)) or cell for cell in bare]
                 yield name.lower() if number else '', name, bare
 
+    def numbered(self) -> Iterator[tuple[str, list[str]]]:
+        """Yield columns of names with a number, or of numbers that count, and these numbers."""
+        for k, name in enumerate(self._sheet.header, start=1):
+            cells = self._sheet.columns.texts(f'#{k}')
+            found = takewhile(bool, map(NUMBERED.fullmatch, cells))
+            numbers = [each[1] for each in found if each]
+            if len(numbers) == len(cells) and len({*numbers}) > len(POSITION):
+                yield name or f'#{k}', numbers
+
     def columns(self) -> Columns:
         """Return our columns: words, and numbers in m and rad."""
         sheet, ours_in = self._sheet.columns, self._columns
@@ -324,7 +334,23 @@ def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
             )
     if refused:
         raise InputError(refused)
+    _refuse_other_order(table, log)
     return '', np.arange(log.count)
+
+
+def _refuse_other_order(table: _Table, log: _Table) -> None:
+    """Refuse rows that stand side by side but have the same numbers in another order."""
+    both = [*product(table.numbered(), log.numbered())]
+    if any(numbers == logged for (_, numbers), (_, logged) in both):
+        return
+    for (name, numbers), (theirs, logged) in both:
+        if Counter(numbers) == Counter(logged):
+            raise InputError(
+                f'the numbers in the column {name} of {table.path} come in another order in the '
+                f'column {theirs} of {log.path}: if they name the poses, write the same '
+                'names, each once, below the same header; if all rows stand side by side, leave '
+                'one of these columns out'
+            )
 
 
 def _shifted(made: Columns, shift: int) -> Columns:

@@ -315,6 +315,27 @@ def test_names_of_poses_need_no_column_of_the_same_name(tmp_path, points, log, o
     assert found.joints[:, 0].tolist() == found.positions[:, 0].tolist()
 
 
+@pytest.mark.parametrize(
+    ('ours', 'theirs', 'count'),
+    [('Nr', 'Pose', 1), ('Point', 'Pose', 1), ('Point', 'Pose', 2), ('Point', 'Point', 2)],
+)
+@pytest.mark.parametrize('order', [[1, 2, 3, 4], [3, 1, 4, 2]])
+def test_numbers_of_poses_in_another_order_are_refused(tmp_path, ours, theirs, count, order):
+    """Their rows were paired side by side."""
+    named = f'{ours} 0' if ours == 'Point' else ''
+    rows = ''.join(f'{named}{k},{k},0,0\n' for k in order)
+    (tmp_path / 'points.csv').write_text(f'{ours},x,y,z\n{rows * count}')
+    rows = ''.join(f'{k},{k}\n' for k in (1, 2, 3, 4))
+    (tmp_path / 'log.csv').write_text(f'{theirs},q1\n{rows * count}')
+    given = Foreign(Layout(), None, tmp_path / 'log.csv')
+    if order[0] != 1:
+        with pytest.raises(InputError, match=f'the numbers in the column {ours} of .* come in an'):
+            read_table(tmp_path / 'points.csv', 1, foreign=given)
+        return
+    (found,) = read_table(tmp_path / 'points.csv', 1, foreign=given).fitted
+    assert found.joints[:, 0].tolist() == found.positions[:, 0].tolist()
+
+
 def test_a_column_of_targets_that_was_given_is_read_beside_one_of_poses(tmp_path):
     """Where poses were matched by a column Target, both targets were taken for one."""
     (tmp_path / 'log.csv').write_text('Target,q1\nP1,1\nP2,2\n')
