@@ -291,9 +291,7 @@ def _text(path: Path) -> tuple[str, str]:
 
 def _of_workbook(path: Path, name: str) -> Iterator[_Content]:
     """Yield the sheets with rows: the one named, or the visible ones."""
-    for title, visible, rows in sheets_of(path, name):
-        told = f'sheet "{title}" of {visible} is read (--sheet)'
-        notes = [told] if visible > 1 and not name else []
+    for title, notes, rows in sheets_of(path, name):
         yield _Content(iter([rows]), notes, title=title)
 
 

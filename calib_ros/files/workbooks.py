@@ -11,15 +11,18 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
-from calib_ros.errors import MOST_ENTRIES, InputError
+from calib_ros.errors import LONGEST, MOST_ENTRIES, InputError
 from calib_ros.files.columns import Cells
 from calib_ros.texts import LARGEST_TABLE
 
 LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
+WITH_FORMULA = re.compile(rb'<(\w+:)?f[ />]')
+WITH_HIDDEN = re.compile(rb'<(\w+:)?row [^>]*\bhidden="(1|true)"')
+READ_HIDDEN = 'rows that are hidden or filtered out are read, too: delete those that do not count'
 
 
-def sheets_of(path: Path, name: str) -> Iterator[tuple[str, int, list[Cells]]]:
-    """Yield the title and the rows of sheets that have any, and how many are visible.
+def sheets_of(path: Path, name: str) -> Iterator[tuple[str, list[str], list[Cells]]]:
+    """Yield the title of sheets that have rows, notes and the rows.
 
     They are the one named, or the visible ones.
     """
@@ -35,8 +38,13 @@ def sheets_of(path: Path, name: str) -> Iterator[tuple[str, int, list[Cells]]]:
                 raise InputError(
                     f'{path} is larger than {LARGEST_SHEET // 10**6} MB when unpacked'
                 )
-            formulas = _formulas(packed)
-        again = None if formulas is None else openpyxl.load_workbook(path, read_only=True)
+            formulas, hidden = _has(packed, WITH_FORMULA), _has(packed, WITH_HIDDEN)
+            never = formulas and any(
+                b'fullCalcOnLoad="1"' in packed.read(part)
+                for part in packed.namelist()
+                if re.match(r'xl/workbook\d*\.xml', part)
+            )
+        again = openpyxl.load_workbook(path, read_only=True) if formulas else None
         with (
             closing(openpyxl.load_workbook(path, read_only=True, data_only=True)) as book,
             nullcontext() if again is None else closing(again),
@@ -49,9 +57,11 @@ def sheets_of(path: Path, name: str) -> Iterator[tuple[str, int, list[Cells]]]:
                 sheet.reset_dimensions()  # stated ones may be too small
                 values = sheet.iter_rows(values_only=True)
                 if again is not None:
-                    values = _computed(sheet, again[sheet.title], bool(formulas))
+                    values = _computed(sheet, again[sheet.title], never)
                 if rows := _rows(path, values):
-                    yield sheet.title, len(visible), rows
+                    told = f'sheet "{sheet.title}" of {len(visible)} is read (--sheet)'
+                    notes = [told] * (len(visible) > 1 and not name) + [READ_HIDDEN] * hidden
+                    yield sheet.title, notes, rows
     except InputError:
         raise
     except zipfile.BadZipFile as err:
@@ -60,22 +70,17 @@ def sheets_of(path: Path, name: str) -> Iterator[tuple[str, int, list[Cells]]]:
         raise InputError(f'cannot read {path}: {" ".join(str(err).split())}') from err
 
 
-def _formulas(packed: zipfile.ZipFile) -> bool | None:
-    """Tell whether formulas were never computed, though they may have values; None without any.
-
-    Programs that write workbooks leave that to Excel, some with values of 0.
-    """
-    names = [name for name in packed.namelist() if '/worksheets/' in name.lower()]
-    for name in names:
-        with packed.open(name) as file:
-            end = b''
-            while block := file.read(1 << 20):
-                if re.search(rb'<(\w+:)?f[ />]', end + block):
-                    parts = packed.namelist()
-                    books = [part for part in parts if re.match(r'xl/workbook\d*\.xml', part)]
-                    return any(b'fullCalcOnLoad="1"' in packed.read(part) for part in books)
-                end = block[-9:]
-    return None
+def _has(packed: zipfile.ZipFile, element: re.Pattern[bytes]) -> bool:
+    """Tell whether any sheet has an element."""
+    for name in packed.namelist():
+        if '/worksheets/' in name.lower():
+            with packed.open(name) as file:
+                end = b''
+                while block := file.read(1 << 20):
+                    if element.search(end + block):
+                        return True
+                    end = block[-LONGEST:]
+    return False
 
 
 def _computed(sheet: Any, source: Any, never: bool) -> Iterator[list[object]]:

@@ -135,3 +135,16 @@ def test_workbooks(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'openpyxl', None)
     with pytest.raises(InputError, match=r'needs openpyxl: pip install "calib_ros\[xlsx\]"'):
         read_table(path, 2, foreign=Foreign(Layout()))
+
+
+@pytest.mark.parametrize('hidden', [False, True])
+def test_hidden_rows_are_told(tmp_path, hidden):
+    """Those that were filtered out in a spreadsheet program were read without a word."""
+    book = pytest.importorskip('openpyxl').Workbook()
+    for row in (NAMES, *np.column_stack([JOINTS, PLACES]).tolist()):
+        book.active.append([*row])
+    book.active.row_dimensions[3].hidden = hidden
+    book.save(tmp_path / 'cell.xlsx')
+    table = read_table(tmp_path / 'cell.xlsx', 2, foreign=Foreign(Layout()))
+    assert_same(table, None)
+    assert ('hidden or filtered out are read' in str(table.warnings)) == hidden
