@@ -146,6 +146,31 @@ def repeating(
     return None
 
 
+def computed_rows(problem: Problem) -> str:
+    """Return that the nominal arm gives some rows far better than any device measures others.
+
+    Nominal poses may stand above or below measured ones, or each beside its own.
+    """
+    seen = problem.observations
+    if seen.pixels is not None or seen.distances is not None or len(seen) < FEWEST_ROWS:
+        return ''
+    rows, arm = np.arange(len(seen)), replace(problem.chain, base=None, tool=None, frames=())
+    third = len(seen) // 3
+    alone = seen.changed(base='base', tool='tool')
+    for parts in (rows < third, rows >= len(seen) - third), (rows % 2 == 0, rows % 2 == 1):
+        trials = [in_frames(problem, arm, (alone.select(part),)) for part in parts]
+        found = sorted(filter(None, trials), key=lambda one: one.error)
+        if len(found) > 1 and found[0].error < EXCEPTION**2 * found[1].error:
+            away = misses(found[0].chain, alone, flange(found[0].chain, alone))
+            near = np.flatnonzero(away < EXCEPTION * found[1].error).tolist()
+            return (
+                f'{rows_in_words(near, seen.stamps_ns, problem.of_messages)} fit the uncorrected '
+                f'arm to {1e3 * found[0].error:.2g} mm, others to {1e3 * found[1].error:.2g} mm: '
+                'are these nominal poses, computed and not measured? Leave them out'
+            )
+    return ''
+
+
 def _where(before: Flags, after: Flags) -> int:
     gain = before.astype(int) - after.astype(int)
     return int(np.argmax(np.concatenate([[0], np.cumsum(gain)])))

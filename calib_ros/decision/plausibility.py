@@ -17,6 +17,7 @@ from scipy import special
 
 from calib_ros.decision.acceptance import out_of_scale
 from calib_ros.decision.delays import uneven
+from calib_ros.decision.lost_rows import computed_rows
 from calib_ros.decision.misfits import explained_share
 from calib_ros.decision.printed_board import stretched
 from calib_ros.decision.reasons import Reason, Rule
@@ -115,14 +116,18 @@ def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
 
 
 def _sessions(problem: Problem, result: Identification) -> str:
-    """Return that sessions with frames of their own fit far better alone: not of one arm."""
+    """Return that sessions with frames of their own, or some rows, fit far better alone."""
+    if result.noise.consistent:
+        return ''
+    if len(problem.sets) == 1:
+        return computed_rows(problem)
     sessions: list[list[Observations]] = []
     for each in problem.sets:
         mine = [s for s in sessions if any(each.base == o.base or each.tool == o.tool for o in s)]
         sessions = [s for s in sessions if s not in mine]
         sessions.append([o for s in mine for o in s] + [each])
     moved = {each.rule for each in result.refusals} & {Rule.ENCODER, Rule.MOVED}
-    if len(sessions) < 2 or result.noise.consistent or moved:
+    if len(sessions) < 2 or moved:
         return ''
     worst = 0.0
     for first, *more in (map(Observations.some_images, s) for s in sessions):

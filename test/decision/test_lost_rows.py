@@ -207,3 +207,22 @@ def test_gross_errors_at_poses_measured_again_and_again_are_no_repeated_joint_va
     result = identify(Problem(UR10E, seen))
     assert result.accepted
     assert 'repeated' not in ' '.join(map(str, result.remarks))
+
+
+@pytest.mark.parametrize('order', ['below', 'above', 'beside'])
+@pytest.mark.parametrize('oriented', [True, False])
+def test_nominal_poses_among_measured_ones_are_named(order, oriented):
+    """Under one header without a title they were fitted: half of the errors stayed."""
+    rng, rows = np.random.default_rng(3), np.arange(80)
+    nominal = {'below': rows >= 40, 'above': rows < 40, 'beside': rows % 2 == 1}[order]
+    true, q = arm(rng), np.zeros((80, 6))
+    q[nominal] = q[~nominal] = UR10E.random_joints(40, rng)
+    seen = measure(true, q, rng, *NOISE, oriented)
+    ideal = replace(UR10E, base=true.base, tool=true.tool).forward(q[nominal])
+    seen.positions[nominal] = ideal[:, :3, 3]
+    if oriented:
+        seen.rotations[nominal] = ideal[:, :3, :3]
+    first = identify(Problem(UR10E, seen)).refusals[0]
+    where = {'below': 'lines 41 to 80', 'above': 'lines 1 to 40', 'beside': 'lines 2, 4'}[order]
+    assert re.match(rf'{where}.* fit the uncorrected arm to .*: are these nominal', str(first))
+    assert identify(Problem(UR10E, seen.select(~nominal))).accepted
