@@ -280,7 +280,7 @@ def _text(path: Path) -> tuple[str, str]:
         except UnicodeDecodeError as err:
             raise InputError(f'cannot read {path}: {err}') from err
     if b'\0' in data:
-        told = 'is not text, and not a workbook by its name (.xlsx)'
+        told = 'is not text, and not a workbook by its name: save it as .xlsx or CSV'
         if path.suffix.lower() in SHEETS:
             told = 'is a workbook, expected a table as text: save the sheet as CSV'
         raise InputError(f'cannot read {path}: it {told}')

@@ -317,7 +317,7 @@ def test_joint_values_that_stand_a_row_below(read):
         *((DEGREES, each, r'line 2: rx, ry, rz .* in degrees, .*--angle deg') for each in
           ({'euler': 'XYZ'}, {'rotation_vector': True})),
         (b'\xff\xfe\0\xd8', {}, 'cannot read .*: unexpected end of data'),
-        (b'PK\xff\0', {}, 'it is not text, and not a workbook by its name'),
+        (b'PK\xff\0', {}, 'not a workbook by its name: save it as .xlsx or CSV'),
         ('q1,x\n1,2\n1,2\0'.encode('utf-16'), {}, 'line 3 '),  # csv of Python 3.10 says it
     ],
 )  # fmt: skip

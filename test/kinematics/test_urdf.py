@@ -246,7 +246,7 @@ XACRO = '<xacro:x xmlns:xacro="http://www.ros.org/wiki/xacro"/></robot>'
 REFUSED = {
     'no XML': ('name: ur10e', 'not valid XML'),
     'cut off': (UR10E[:-40], 'not valid XML'),
-    'no robot': ('<sdf/>', 'root element <robot>, not <sdf>'),
+    'no robot': ('<sdf/>', 'root element <robot>, not <sdf>: convert it'),
     'empty': ('<robot/>', 'tree with one root; roots here: none'),
     'xacro': (edited(UR10E, '</robot>', XACRO), 'run "xacro FILE > robot.urdf" first'),
     'formula': (edited(UR10E, '-0.6127', '${a}'), '"elbow_joint" is a formula'),
