@@ -24,7 +24,7 @@ from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
 Positive: TypeAlias = Annotated[float, lambda x: 0.0 < x < math.inf, 'a positive number']
 InMetres: TypeAlias = Annotated[float, lambda x: 0.0 < x <= 0.1, 'between 0 and 0.1 metres']
 NotNegative: TypeAlias = Annotated[float, lambda x: 0.0 <= x < math.inf, 'a number of at least 0']
-Limit: TypeAlias = Annotated[float, lambda x: x >= 0.0, 'a number of at least 0']  # inf: none
+Limit: TypeAlias = Annotated[float, lambda x: x > 0.0, 'a positive number']  # inf: none
 Share: TypeAlias = Annotated[float, lambda x: 0.0 < x < 1.0, 'between 0 and 1, as 0.95']
 Confidence: TypeAlias = Annotated[float, lambda x: 0.5 < x < 1.0, 'between 0.5 and 1']
 Fraction: TypeAlias = Annotated[float, lambda x: 0.0 <= x < 1.0, 'at least 0 and below 1']

@@ -128,13 +128,13 @@ class Settings:
     frame_id: str = _setting('', 'required frame of the measurements; default: any')
     folds: int = _setting(5, 'number of cross-validation folds', 2)
     largest_length: float = _setting(
-        0.05, 'a larger change of a length is not accepted: wrong robot? [m]', 0.0
+        0.05, 'a larger change of a length is not accepted: wrong robot? [m]', 1e-9
     )
     largest_angle: float = _setting(
-        0.1, 'a larger change of an angle is not accepted: wrong robot? [rad]', 0.0
+        0.1, 'a larger change of an angle is not accepted: wrong robot? [rad]', 1e-9
     )
     largest_error: float = _setting(
-        0.01, 'a larger RMS error on held-out poses is not accepted: wrong robot? [m]', 0.0
+        0.01, 'a larger RMS error on held-out poses is not accepted: wrong robot? [m]', 1e-9
     )
     loss: str = _setting('redescending', 'treatment of gross errors: redescending, huber or none')
     priors: tuple[str, ...] = _setting(

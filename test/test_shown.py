@@ -106,8 +106,8 @@ def test_results_are_read_only():
         *(
             (partial(calib_ros.Problem, CHAIN, SEEN, **{name: value}), f'{name} must be {what}')
             for name, value, what in (
-                ('largest_length', -1.0, 'a number of at least 0, not -1.0'),
-                ('largest_angle', -1.0, 'a number of at least 0'),
+                ('largest_length', -1.0, 'a positive number, not -1.0'),
+                ('largest_angle', 0.0, 'a positive number'),  # their priors were divided by it
                 ('largest_error', np.nan, 'of type float, not nan'),
                 ('sigma_position', 0.0, 'a positive number, not 0.0'),
                 ('sigma_touch', np.inf, 'a positive number'),
@@ -120,7 +120,7 @@ def test_results_are_read_only():
             for name, value in (
                 *(('sigma_position', 0.0), ('sigma_position', -1e-4), ('sigma_position', np.nan)),
                 *(('sigma_orientation', np.inf), ('max_gap', -0.1), ('max_gap', np.inf)),
-                *(('joint_buffer', 1), ('pose_buffer', 0), ('folds', 1)),
+                *(('joint_buffer', 1), ('pose_buffer', 0), ('folds', 1), ('largest_angle', 0.0)),
             )
         ),
         (partial(calib_ros.Problem, CHAIN, SEEN, priors={'*.a': 0}), r"priors\['\*.a'\] must"),
