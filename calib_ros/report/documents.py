@@ -90,7 +90,7 @@ def figures_document(which: Comparison, intervals: bool = True) -> dict[str, Any
     return found
 
 
-def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
+def configuration_yaml(chain: str, settings: Settings, **more: Any) -> str:
     """Return settings and `more` as a parameter file that repeats the run in a node."""
     parameters: dict[str, Any] = {'chain': chain, **more}
     for name, value in asdict(settings).items():

@@ -38,6 +38,7 @@ from calib_ros.identification.recalibration import recalibrate
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import documents, words
 from calib_ros.ros.advisor import Guide
+from calib_ros.ros.arguments import PARAMETERS
 from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, InOrder, run_node
 from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.identifying import Filer, Identifying
@@ -58,6 +59,11 @@ TAKING_PERIOD = DIAGNOSTICS_PERIOD / 10.0
 three times as much."""
 JOIN_TIMEOUT = DIAGNOSTICS_PERIOD  # time [s] for which the shutdown waits for running work
 WRITING = {'~/export', '~/save'}  # whose work is not cut off, since it writes files
+BESIDE_A_JOURNAL = (
+    *('base_link', 'tip_link', 'serial', 'socket', 'largest_loss'),
+    *('base_frame', 'flange_frame', 'target_frame'),
+)
+"""Parameters of the session that are no `Settings`."""
 STATUS_LENGTH = 120  # characters of the status: `ros2 topic echo` cuts texts at 128
 
 
@@ -174,10 +180,9 @@ class CalibrationNode(Batched):
     # Parameters
 
     def _configuration(self) -> str:
-        given = self._given
-        more = {**given.links, 'serial': given.serial}
-        more = {name: value for name, value in more.items() if value}
-        return documents.configuration_yaml(given.chain, self.session.settings, **more)
+        more = {name: self.get_parameter(name).value for name in BESIDE_A_JOURNAL}
+        more = {name: v for name, v in more.items() if v != PARAMETERS[name].default}
+        return documents.configuration_yaml(self._given.chain, self.session.settings, **more)
 
     def _check_parameters(self, changes: Sequence[Any]) -> SetParametersResult:
         """Refuse settings that no identification could use, forbidden files, and sockets."""
