@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Slice
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Slice, StreamKey
 
 STRAY = 'stamp far from those before and after (do the clocks of all publishers agree?)'
 
@@ -31,6 +31,12 @@ class Gate:
     def held(self, kind: str) -> int:
         """Return the number of held messages of a kind."""
         return sum(each[0] == kind for each in self._held)
+
+    @property
+    def images(self) -> set[int]:
+        """Return the numbers of held images."""
+        found = ((each.key, each.numbers) for *_, given in self._held for each in given.pieces)
+        return {int(n[0, 0]) for key, n in found if isinstance(key, StreamKey) and key.images}
 
     def through(self, given: Slice) -> Iterator[tuple[Slice, bool]]:
         """Yield what may pass now, and whether the joints' clock was moved back before it.

@@ -375,7 +375,7 @@ class CalibrationSession:
 
     def _settle(self, wait: bool = False) -> None:
         self._take((), wait)
-        self.pictures.keep_only(self._collector.waiting.images)
+        self.pictures.keep_only(self._collector.waiting.images | self._pipeline.gate.images)
 
     def _take(self, made: Sequence[Sample], wait: bool = False) -> int:
         fresh = self.pictures.through(made, wait)

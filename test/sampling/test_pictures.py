@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from calib_ros.files.cameras import grey
+from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling import pictures
 from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.slices import Part
+from calib_ros.sampling.sources import parse_sources
 
 pytest.importorskip('cv2')
 
@@ -57,6 +61,21 @@ def test_memory_for_images_is_bounded(monkeypatch):
     assert newest in kept._kept
     assert 4 < len(kept._kept) <= 10
     assert np.diff(list(kept._kept)).max() < 40  # old ones are among them
+
+
+def test_the_first_image_after_a_pause_is_kept_until_its_clock_is_known():
+    """Its stamp waits at the gate for joint states, and it was forgotten meanwhile."""
+    (camera,) = parse_sources(('/image board=board.yaml',))
+    session = CalibrationSession(load_chain('ur10e'))
+    names = ('', *session.joint_names)
+    session.take([Part(np.array([0]), None, names, np.array([10**18]), np.zeros((1, 6)))])
+    number = session.pictures.keep('/image', 1, lambda: None)
+    stamps = np.array([10**18 + 10**11])
+    session.take([Part(np.array([0]), camera, ('camera',), stamps, np.array([[number * 1.0]]))])
+    assert [*session.pictures._kept] == [number]
+    stamps = stamps + 10**8 * np.arange(1, 31)
+    session.take([Part(np.arange(30), None, names, stamps, np.linspace(0, 1, 180).reshape(-1, 6))])
+    assert not session.pictures._kept  # the arm was moving
 
 
 def test_bayer_patterns_and_colours_become_grey():
