@@ -66,6 +66,11 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
             'parameter "chain" is not set: give the chain file of the robot, for example '
             '--ros-args -p chain:=ur10e; in a parameter file under the key /**'
         )
+    if not own['target_frame']:
+        raise ConfigError(
+            'parameter "target_frame" must not be empty: it is the frame of what a camera on the '
+            'flange measures; name it, or leave it out'
+        )
     return Given(**own, settings=settings), [*overrides]
 
 

@@ -129,6 +129,7 @@ def test_all_of_an_atomic_change_or_nothing(idle):
     [
         ({'chain': ''}, 'parameter "chain" is not set'),
         ({'chain': 'ur10f'}, 'another arm needs a URDF or a chain file'),
+        ({'target_frame': ''}, 'parameter "target_frame" must not be empty'),
         ({'folds': 5.5}, 'parameter "folds" must be a whole number, not 5.5'),
         ({'mode': 'dwel'}, 'did you mean "dwell"'),
         ({'fixed': ['joint_2.a']}, 'unknown parameter "joint_2.a"'),
