@@ -54,7 +54,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import norms
 from calib_ros.settings import EXCEPTION, LEVER
-from calib_ros.shown import rows_in_words
+from calib_ros.shown import rounded, rows_in_words
 
 Tries: TypeAlias = Sequence[tuple[Trial, Suspect]]
 
@@ -84,8 +84,8 @@ class Explained:
         if np.isnan(self.corrected):
             return Reason(Rule.MISTAKE, f'{self.where}{whats[0]}')
         errors = (
-            f' (the uncorrected arm is then typically {1e3 * self.corrected:.2f} mm off, not '
-            f'{float(f"{1e3 * self.given:.4g}"):g} mm)'
+            f' (the uncorrected arm is then typically {rounded(1e3 * self.corrected)} mm off, not '
+            f'{rounded(1e3 * self.given)} mm)'
         )
         return Reason(Rule.MISTAKE, f'{self.where}{" -- or ".join(whats)}', errors)
 

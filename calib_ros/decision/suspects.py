@@ -42,6 +42,7 @@ MIXED_UP_UNITS = (
 )
 """Actual unit of angles, assumed unit, option, and size of the actual in the assumed one."""
 SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254, 'ft': 0.3048}
+NAMES = {'in': 'inches', 'ft': 'feet'}  # of units too short to be read as such
 FIRST = ('measured', 'handed', 'order')
 """Parts whose mistakes are undone before those of single joints."""
 NOT_ON_FLANGE = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
@@ -123,9 +124,10 @@ def _units(chain: Chain) -> Iterator[Suspect]:
     whole = 'positions and linear joints' if _linear(chain) else 'positions'
     degrees = of_kind(chain, 'revolute', np.radians(1.0))
     for unit, size in SCALES.items():
+        name = NAMES.get(unit, unit)
         for way, option, factor in (
-            (f'in {unit}, not metres', f'--length {unit}', size),
-            (f'in metres, not {unit}', '--length m', 1.0 / size),
+            (f'in {name}, not metres', f'--length {unit}', size),
+            (f'in metres, not {name}', '--length m', 1.0 / size),
         ):
             what, changes = f'the {whole} are {way}', lengths(chain, factor)
             yield Suspect(what, option, changes)
@@ -142,7 +144,8 @@ def _linear(chain: Chain) -> list[str]:
 def _of_lengths(key: str, columns: Sequence[str], change: Rescaled) -> Iterator[Suspect]:
     """Yield units of some lengths alone."""
     for unit, size in SCALES.items() if columns else ():
-        for way, factor in ((f'{unit}, not metres', size), (f'metres, not {unit}', 1.0 / size)):
+        name = NAMES.get(unit, unit)
+        for way, factor in ((f'{name}, not metres', size), (f'metres, not {name}', 1.0 / size)):
             option = '--columns ' + ','.join(f'{each}={each}*{factor:g}' for each in columns)
             yield Suspect(f'the {key} are in {way}', option, (change(factor),), 2, part='measured')
 

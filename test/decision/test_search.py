@@ -179,10 +179,11 @@ def test_what_is_wrong_with_some_rows_is_not_the_arm(searched, monkeypatch):
 
 
 def test_errors_with_and_without_a_mistake_are_told_in_millimetres():
-    told = Explained((Suspect('a', 'undo a'), Suspect('b', 'undo b')), 0.123456, 0.0012)
+    told = Explained((Suspect('a', 'undo a'), Suspect('b', 'undo b')), 23.456789, 0.0012)
     said = 'a: undo a -- or b: undo b'
     assert told.reason.short == said
-    assert str(told) == f'{said} (the uncorrected arm is then typically 1.20 mm off, not 123.5 mm)'
+    off = 'the uncorrected arm is then typically 1.200 mm off, not 23,457 mm'
+    assert str(told) == f'{said} ({off})'
 
 
 MISTAKES = [('a', 1, 'measured'), ('b', 1, 'order'), ('c', 1, 'j1'), ('d', 1, 'j2')]
