@@ -70,6 +70,10 @@ REUSED = (
     Headline('open', 'No verdict: the calibration was computed from these measurements'),
     (f'Measure new poses, {SPREAD_OUT}, and verify with those alone.',),
 )
+WITHIN = (
+    'Measure more poses within the region of the calibration, and verify again with all that are '
+    'within it.'
+)
 MISTAKEN = (
     Headline('open', 'No verdict: the measurements do not fit the arm'),
     ('Check what is named in the robot and in the data, correct it, and verify again.',),
@@ -86,6 +90,8 @@ def standing(found: Verification) -> tuple[Headline, tuple[str, ...]]:
     if not found.by_program:  # nor whether the correction reaches the arm
         state = replace(state, heading=state.heading.replace('the arm', 'the calibration'))
         steps = tuple(each for each in steps if each != ACTIVE)
+    if found.verdict == 'UNDECIDED' and found.outside:
+        steps = (WITHIN,)
     if state.state in ('bad', 'open') and (why := causes(found)):
         steps = tuple(map(sentence, why))
     return state, steps
@@ -138,15 +144,16 @@ def hints(found: Verification) -> list[str]:
     lines = []
     if found.fitted:
         lines.append(f'{" and ".join(found.fitted)} refitted, before and after alike')
-    if found.verdict == 'UNDECIDED':
+    if found.verdict == 'UNDECIDED' and not found.outside:
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
         lines.append(f'{enough} poses with the same RMS error would decide, these included')
     before, rms = (each.rms_mm for each in found.comparison.figures)
     if found.outside and not found.mistake:
+        share = round(100.0 * found.outside) or 'less than 1'
         lines.append(
-            f'{100.0 * found.outside:.3g} % of the measurements are outside the region of the '
-            'calibration, where it may make the arm worse and compensate refuses: verify within '
-            'it, or identify with poses like these'
+            f'{share} % of the measurements are outside the region of the calibration, where it '
+            'may make the arm worse and compensate refuses: verify within it, or identify with '
+            'poses like these'
         )
     if rms > before and not (found.mistake or found.uncorrected or causes(found)):
         whose = '' if found.outside > 0.5 else ': is the calibration that of this robot?'

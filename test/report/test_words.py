@@ -19,7 +19,7 @@ from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report import words
-from calib_ros.report.advice import FAR
+from calib_ros.report.advice import FAR, SPREAD_OUT
 from calib_ros.report.reports import CLOSER, may_be_closer
 from calib_ros.report.verdicts import standing
 from calib_ros.report.words import between, still_holds, verdict
@@ -148,6 +148,18 @@ def test_effects_are_proposed_where_far_more_than_noise_is_left_and_none_was_tri
     steps = report_of(problem, left).steps
     assert (sentence(CLOSER) in steps) == (ratio > 1.0)
     assert not may_be_closer(replace(left, verdicts=(None,)), beyond=True)
+
+
+def test_poses_outside_the_region_do_not_lead_to_more_of_them():
+    arm, rng = load_chain('ur10e'), np.random.default_rng(2)
+    seen = measure(arm, arm.random_joints(8, rng), rng, 5e-5, 2e-4)
+    found = replace(verify(Calibration(arm, arm), [seen], 1e-3), verdict='UNDECIDED', needed=50)
+    assert SPREAD_OUT in standing(found)[1][0]
+    assert 'about 50 poses' in in_words(found)
+    partly = replace(found, outside=0.004)
+    assert 'within the region' in standing(partly)[1][0]
+    assert 'less than 1 % of the measurements are outside' in in_words(partly)
+    assert 'about 50 poses' not in in_words(partly)
 
 
 def test_drift_is_errors_shared_in_succession_only():
