@@ -269,9 +269,9 @@ def show(found: Identified, screen: Screen) -> None:
 
 def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) -> None:
     if result.accepted:
-        drift = words.drift_in_words(result.noise)
+        disturbed = words.disturbed_in_words(result.noise)
         closer = reports.CLOSER if reports.may_be_closer(result) else ''
-        notes = *reports.doubts(result), drift, *words.notes(result), closer, UNCHANGED
+        notes = *reports.doubts(result), disturbed, *words.notes(result), closer, UNCHANGED
         for note in notes:
             if note:
                 screen.bullet(note)

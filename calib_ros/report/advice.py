@@ -92,8 +92,8 @@ BRINGS[Rule.EXCITATION] = {Rule.EXCITATION, Rule.GAIN, Rule.REGION}
 FAR = 1.0 / EXCEPTION
 """Ratio of residuals to stated noise that an arm's own errors rarely reach."""
 COARSE = (
-    'The measurements scatter {:.0f} times as much as stated (sigma_position): check that target '
-    'and device sit firmly, the arm stood still, and the clocks agree.'
+    'The remaining error is {:.0f} times the stated device noise: check that target and device '
+    'sit firmly, the arm stood still, and the clocks agree.'
 )
 """First check if the measurements are far too coarse."""
 FEW_POSES = 'Only {} different poses were measured: too few to be sure of anything about the arm.'

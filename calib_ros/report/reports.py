@@ -62,7 +62,7 @@ def identification_report(
     corrected, notes = 'none: not accepted', words.other_remarks(result)
     if result.accepted:
         corrected = table_hash(result.chain)
-        notes = [*filter(None, (words.drift_in_words(result.noise),))]
+        notes = [*filter(None, (words.disturbed_in_words(result.noise),))]
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,
@@ -203,7 +203,7 @@ def _steps(
 
 
 def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterator[Section]:
-    drift = result.accepted and words.drift_in_words(result.noise)
+    drift = result.accepted and words.drifts(result.noise)
     yield section(
         'noise',
         'Remaining errors against device noise',

@@ -24,6 +24,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
+from calib_ros.report.advice import COARSE, FAR
 from calib_ros.settings import Settings
 from calib_ros.shown import counted, moment, of_them, rounded, some
 
@@ -265,9 +266,11 @@ def scatter_in_words(noise: Noise) -> str:
     return f'{text} The intervals are widened accordingly.'
 
 
-def drift_in_words(noise: Noise) -> str:
-    """Return the evidence for drift, and how to avoid it next time; empty if there is none."""
-    return f'{neighbours_in_words(noise)} {STEADY}' if drifts(noise) else ''
+def disturbed_in_words(noise: Noise) -> str:
+    """Return that the device drifts, or far more is left than its noise; empty if neither."""
+    if drifts(noise):
+        return f'{neighbours_in_words(noise)} {STEADY}'
+    return COARSE.format(noise.position) if noise.position >= FAR else ''
 
 
 def drifts(noise: Noise) -> bool:

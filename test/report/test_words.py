@@ -150,6 +150,15 @@ def test_effects_are_proposed_where_far_more_than_noise_is_left_and_none_was_tri
     assert not may_be_closer(replace(left, verdicts=(None,)), beyond=True)
 
 
+def test_far_more_than_noise_is_left_asks_what_was_loose_even_if_accepted(solved):
+    problem, result = solved
+    assert result.accepted
+    coarse = replace(result, noise=replace(result.noise, position=9.0 * FAR, shared=()))
+    said = f'{9.0 * FAR:.0f} times the stated device noise: check that target and device sit'
+    assert said in str(report_of(problem, coarse).remarks)
+    assert said not in str(report_of(problem, result).remarks)
+
+
 def test_poses_outside_the_region_do_not_lead_to_more_of_them():
     arm, rng = load_chain('ur10e'), np.random.default_rng(2)
     seen = measure(arm, arm.random_joints(8, rng), rng, 5e-5, 2e-4)
@@ -165,7 +174,7 @@ def test_poses_outside_the_region_do_not_lead_to_more_of_them():
 def test_drift_is_errors_shared_in_succession_only():
     for shared in ((), ('near',), ('successive',), ('successive', 'near')):
         noise = Noise(1.0, None, True, 0.3, 0.2, shared, widened=1.5)
-        assert bool(words.drift_in_words(noise)) == (shared == ('successive',))
+        assert bool(words.disturbed_in_words(noise)) == (shared == ('successive',))
     said = words.neighbours_in_words(noise)
     assert 'measured in succession (0.30) and near each other in joint space (0.20)' in said
     assert 'standard deviations 1.50 times as large' in said
@@ -195,7 +204,7 @@ def test_the_limits_of_an_interval_have_the_same_decimals(monkeypatch, limits, s
 def test_a_drift_is_named_though_it_shows_between_neighbours_too(successive, near, drifting):
     """A simulated drift; the measured positioner and Panda, whose arms have errors left."""
     noise = Noise(6.0, None, False, successive, near, ('successive', 'near'))
-    assert ('warm up' in words.drift_in_words(noise)) == drifting
+    assert ('warm up' in words.disturbed_in_words(noise)) == drifting
     assert words.drifts(replace(noise, shared=('near',))) is False
 
 
