@@ -98,8 +98,8 @@ COARSE = (
 """First check if the measurements are far too coarse."""
 FEW_POSES = 'Only {} different poses were measured: too few to be sure of anything about the arm.'
 LEFT = (
-    'The remaining error corresponds to a device noise of {:.2g} mm in each direction; '
-    'sigma_position is {:.2g} mm.'
+    'The remaining error corresponds to a device noise of {:.2g} mm in each direction; {:.2g} mm '
+    'is stated (--sigma-position).'
 )
 DRIFTS = (
     'Poses measured in succession have similar errors, as if the device drifted: let it warm up '

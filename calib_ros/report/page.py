@@ -198,7 +198,8 @@ def _template(name: str) -> str:
 def with_code(text: str) -> str:
     """Return a text as HTML, with commands and options as code that does not break at hyphens."""
     parts = enumerate(map(html.escape, TYPED.split(str(_shown(text)))))
-    return ''.join(f'<code>{part}</code>' if k % 2 else part for k, part in parts)
+    typed = ''.join(f'<code>{part}</code>' if k % 2 else part for k, part in parts)
+    return re.sub(r'\((<code>.*?</code>)', r'<span class="whole">(\1</span>', typed)
 
 
 def _shown(value: object) -> object:

@@ -249,7 +249,7 @@ def verification_report(
         ),
         picture=pictured,
         steps=steps,
-        remarks=(*warnings, *not_steps(hints(found) + causes(found), steps)),
+        remarks=(*warnings, *map(sentence, not_steps(hints(found) + causes(found), steps))),
         identity=sections.identity_of(chain, origin, poses, [different], table_hash(chain)),
         explorer=explorer(chain, poses),
         sections=(
@@ -273,13 +273,18 @@ def _by_configuration(found: Verification) -> Section:
             'Errors at the joint values reported: of the mean over all cycles, and their scatter, '
             'mean + 3 sigma. AP and RP of ISO 9283 need the program (--commanded).'
         )
+    shown = 2 + any(each.repeatability is not None for each in found.each)
     return section(
         'configurations',
         title,
         text,
-        head=('pose', 'cycles', *names),
+        head=('pose', 'cycles', *names[:shown]),
         rows=tuple(
-            (f'P{k}', str(cycles), *('' if x is None else rounded(x) for x in values))
+            (
+                f'P{k}',
+                str(cycles),
+                *('' if x is None else rounded(x) for x in values[:shown]),
+            )
             for k, (cycles, *values) in enumerate(found.each, 1)
         ),
     )

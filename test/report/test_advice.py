@@ -50,7 +50,7 @@ def test_no_gain_is_told_by_how_much_was_measured_and_what_is_left():
     assert few.meaning.startswith('Only 14 different poses')
     assert few.steps == advice.rules()[Rule.CONFIGURATIONS].steps
     (enough,) = advice.advice(refused, advice.Situation(poses=50, left=4.62, sigma=1e-4))
-    assert 'noise of 0.46 mm in each direction; sigma_position is 0.1 mm' in enough.meaning
+    assert 'noise of 0.46 mm in each direction; 0.1 mm is stated' in enough.meaning
 
 
 def test_outliers_are_to_be_looked_at_if_much_is_left():

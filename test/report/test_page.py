@@ -246,6 +246,13 @@ def test_options_are_code_with_their_values(text, code):
     assert f'<code>{code}</code>' in page.with_code(text)
 
 
+def test_no_line_ends_between_a_bracket_and_its_code():
+    found = page.with_code('fit (--session A,B), (or --force) (--new-base)')
+    for code in ('--session A,B', '--new-base'):
+        assert f'<span class="whole">(<code>{code}</code></span>' in found
+    assert found.count('whole') == 2
+
+
 def test_no_pose_is_called_judged_where_none_was_left_out():
     problem = Problem(UR, measured(count=5))
     result = identify(problem)

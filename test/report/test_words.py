@@ -169,6 +169,10 @@ def test_poses_outside_the_region_do_not_lead_to_more_of_them():
     assert 'within the region' in standing(partly)[1][0]
     assert 'less than 1 % of the measurements are outside' in in_words(partly)
     assert 'about 50 poses' not in in_words(partly)
+    page = verification_page(arm, [seen], partly)
+    assert all(each[0].isupper() and each.endswith('.') for each in page.remarks)
+    assert 'cycles' in page.sections[0].head
+    assert not any('scatter' in each for each in page.sections[0].head)
 
 
 def test_drift_is_errors_shared_in_succession_only():
