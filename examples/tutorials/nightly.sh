@@ -20,7 +20,7 @@ for bag in sorted(each for each in Path('night').iterdir() if each.is_dir()):
     result = identify(session.problem())
     for refusal in result.refusals:
         failed.append(f'{bag.name}: {refusal}')
-    after = result.validation.figures[1].rms_mm
+    after = (result.validation or result.fitted).figures[1].rms_mm
     if after > LARGEST:
         failed.append(f'{bag.name}: RMS {after:.3f} mm')
 if failed:
