@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path, PurePosixPath
@@ -186,6 +186,7 @@ def _state(files: Any, path: str, info: dict[str, Any]) -> tuple[str, datetime |
         if part.get('size') is None or not dates + sums:
             return '', None
         marks.append([name, part['size'], *map(str, dates + sums)])
+        dates.append(part.get('date_time'))  # in archives (zip)
         times += [each for each in map(_moment, dates) if each is not None]
     return rows.digest(marks), max(times, default=None)
 
@@ -193,4 +194,7 @@ def _state(files: Any, path: str, info: dict[str, Any]) -> tuple[str, datetime |
 def _moment(value: object) -> datetime | None:
     if isinstance(value, int | float):
         return datetime.fromtimestamp(value, timezone.utc)
+    if isinstance(value, tuple):  # without a zone; of a month 0, if the archive has no dates
+        with suppress(ValueError):
+            return datetime(*value).replace(tzinfo=timezone.utc)
     return value if isinstance(value, datetime) and value.tzinfo else None

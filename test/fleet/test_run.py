@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 import json
+import zipfile
 from dataclasses import replace
-from datetime import timedelta
+from datetime import datetime, timedelta, timezone
 from unittest.mock import ANY
 
 import plants
@@ -248,6 +249,17 @@ def test_hidden_files_are_no_nights(plant, tmp_path):
         assert wrong == {}
     (own,), _ = sources(replace(plant[0], measured=(Pattern(str(nights / '.002.csv')),)))
     assert own.name == str(nights / '.002.csv')
+
+
+def test_tables_in_an_archive_have_its_dates(plant, tmp_path):
+    """Without stamps of its own each was of the moment of its identification, in any order."""
+    with zipfile.ZipFile(tmp_path / 'nights.zip', 'w') as archive:
+        for name, date in (('a.csv', (2026, 3, 29, 2, 30, 0)), ('b.csv', (1980, 0, 0, 0, 0, 0))):
+            archive.writestr(zipfile.ZipInfo(name, date), 'q1')
+    url = f'zip://*.csv::file://{tmp_path}/nights.zip'
+    found, _ = sources(replace(plant[0], measured=(Pattern(url),)))
+    dated = datetime(2026, 3, 29, 2, 30, tzinfo=timezone.utc)
+    assert [each.modified for each in found] == [dated, None]
 
 
 def test_a_store_that_fails_costs_its_pattern_only(plant, tmp_path, monkeypatch):
