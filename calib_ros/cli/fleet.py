@@ -41,8 +41,8 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     screen.title(title, number['fine'] == len(found))
     for each in found:
         for words in each.actions:
-            Screen().bullet(f'{each.robot.serial}, {words}')  # even if quiet: the mail of cron
-        for error in each.errors.values():
+            Screen().say(f'- {each.robot.serial}, {words}')  # even if quiet: the mail of cron
+        for error in each.unread:
             screen.warn(f'{each.robot.serial}: {error}')
         for remark in () if options.quiet else each.remarks:
             screen.warn(f'{each.robot.serial}: {remark}', 'note')

@@ -213,24 +213,27 @@ def _client(cluster: Cluster) -> Iterator[Any]:
     logging.getLogger('distributed.client').setLevel(logging.CRITICAL)  # LostError says it
     with ExitStack() as stack:
         where: Any = cluster.address
-        if not where:
-            stack.enter_context(dask.config.set(DASK))
-            local = LocalCluster(
-                n_workers=cluster.workers or None,
-                threads_per_worker=1,
-                processes=True,
-                memory_limit=cluster.memory,
-                dashboard_address='127.0.0.1:0',
-                silence_logs=logging.ERROR,
-            )
-            where = stack.enter_context(local)
+        limited = '' if where else f' (--memory {cluster.memory})'
         try:
+            if not where:
+                stack.enter_context(dask.config.set(DASK))
+                local = LocalCluster(
+                    n_workers=cluster.workers or None,
+                    threads_per_worker=1,
+                    processes=True,
+                    memory_limit=cluster.memory,
+                    dashboard_address='127.0.0.1:0',
+                    silence_logs=logging.ERROR,
+                )
+                where = stack.enter_context(local)
             client = stack.enter_context(Client(where, set_as_default=False, timeout=ANSWER_S))
             client.wait_for_workers(1, timeout=ANSWER_S)
-        except (OSError, TimeoutError, ValueError) as err:
-            raise LostError(f'no workers at {cluster.address or "this machine"}: {err}') from err
+            versions = set(client.run(_version).values())
+        except (OSError, TimeoutError, ValueError, RuntimeError) as err:
+            there = cluster.address or 'this machine'
+            raise LostError(f'no workers at {there}{limited}: {err}') from err
         own = calib_ros.__version__
-        if others := ', '.join(sorted(set(client.run(_version).values()) - {own})):
+        if others := ', '.join(sorted(versions - {own})):
             raise ConfigError(f'workers have calib_ros {others}, this is {own}: install the same')
         yield client
 

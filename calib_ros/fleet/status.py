@@ -106,6 +106,14 @@ class RobotStatus:
         return tuple(found)
 
     @property
+    def unread(self) -> tuple[str, ...]:
+        """Return what could not be used: each error with its source."""
+        return tuple(
+            error if source in error else f'{error} ({source})'
+            for source, error in self.errors.items()
+        )
+
+    @property
     def share(self) -> float:
         """Return the error as a share of the tolerance; 0 if unknown."""
         if self.last is None or self.last.rms_mm is None or self.robot.tolerance is None:

@@ -17,6 +17,7 @@ from calib_ros.cli import identify
 from calib_ros.cli.common import Status
 from calib_ros.cli.main import main
 from calib_ros.files.history import History
+from calib_ros.files.rows import Row
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import read_plant
 
@@ -250,6 +251,33 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
     plant['robots'][1]['measured'] = 'nowhere/*.csv'
     (folder / 'plant.yaml').write_text(json.dumps(plant))
     assert main(command) == Status.INCOMPLETE
+
+
+def test_robots_are_called_as_in_the_plant_and_each_error_has_its_file(
+    folder, monkeypatch, capsys
+):
+    """'zelle 3' was told as 'Zelle 3', and too few poses without the file that has them."""
+    (plant,) = read_plant(plants.write_plant(folder, ['zelle 3'], 0))
+    about = {'kind': 'identify', 'verdict': 'refused', 'chain': '{}', 'reasons': ('bad poses',)}
+    filed = Row(plant.serial, plants.when(0), 'i', plant.settings_hash, **about)
+    History('history').file(filed)
+    told = {'few.csv': 'too few poses', 'x.csv': 'x.csv has no rows'}
+    done = running.Run(errors={plant.serial: told})
+    monkeypatch.setattr(running, 'run', lambda *_: done)
+    assert main(['fleet', 'plant.yaml', '--history', 'history']) == Status.NOT_ACCEPTED
+    out, err = capsys.readouterr()
+    assert '- zelle 3, not accepted: bad poses\n' in out
+    assert err == (
+        'warning: zelle 3: too few poses (few.csv)\nwarning: zelle 3: x.csv has no rows\n'
+    )
+
+
+def test_memory_that_is_no_size_or_too_small_is_told(folder, capsys):
+    plants.write_plant(folder, ['A'], 1)
+    for memory in ('abc', '2'):
+        command = ['fleet', 'plant.yaml', '--history', 'history', '--workers', '1']
+        assert main([*command, '--memory', memory]) == 1
+        assert f'no workers at this machine (--memory {memory}): ' in capsys.readouterr().err
 
 
 def test_what_cannot_be_asked_for(folder, capsys):
