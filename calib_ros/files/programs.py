@@ -224,7 +224,8 @@ def read_program(path: Path, chain: Chain) -> ProgramFile:
 def _read_csv(path: Path, chain: Chain) -> ProgramFile:
     table, separator, text = _columns(path)
     found, names, units, program = _program(table, chain)
-    signs = joint_columns(len(names), 's')
+    small = joint_columns(len(names), 's')
+    signs = [each if each in found.header else each.upper() for each in small]  # beside Q1 ... Qn
     known = [k for k, sign in enumerate(signs) if sign in found.header]
     if len({*known, *chain.held}) == len(signs):
         approach = np.zeros((len(found.lines), len(signs)))

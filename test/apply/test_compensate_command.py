@@ -244,9 +244,10 @@ def test_line_breaks_in_names_of_columns_are_blanks(tmp_path):
     assert source.text_with(source.program) == given
 
 
-def test_signs_in_a_table_are_the_approach(tmp_path):
+@pytest.mark.parametrize('header', ['q1,q2,s1,s2', 'Q1,Q2,S1,S2'])
+def test_signs_in_a_table_are_the_approach(tmp_path, header):
     path = tmp_path / 'program.csv'
-    path.write_text('q1,q2,s1,s2\n1,2,-0.5,0\n3,4,1,7\n')
+    path.write_text(f'{header}\n1,2,-0.5,0\n3,4,1,7\n')
     arm = Chain('arm', 'standard', (Joint('a'), Joint('b')))
     program = read_program(path, arm).program
     np.testing.assert_array_equal(program.approach, [[-1.0, 0.0], [1.0, 1.0]])
