@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
@@ -99,42 +99,48 @@ def _matching(url: str, session: str) -> list[SourceFile]:
 
 def work(task: Task) -> Outcome:
     """Do a task; an error is that of its source and harms nothing else."""
-    begin = time.monotonic()
+    begin, path = time.monotonic(), None
     try:
-        outcome = _outcome(task)
+        with fetched(task.source.url) as path:
+            outcome = _outcome(task, path)
     except Exception as err:  # costs only this source
         kind = '' if isinstance(err, CalibrationError | OSError) else f'{type(err).__name__}: '
-        outcome = Outcome(error=shortened(f'{kind}{err}'))
+        (words,) = _named(task, path, (f'{kind}{err}',))
+        outcome = Outcome(error=shortened(words))
     return outcome._replace(seconds=time.monotonic() - begin)
 
 
-def _outcome(task: Task) -> Outcome:
+def _named(task: Task, path: Path | None, told: Sequence[str]) -> list[str]:
+    """Return what is told of a source with its name, not that of the copy."""
+    return [words.replace(str(path), task.source.url) if path else words for words in told]
+
+
+def _outcome(task: Task, path: Path) -> Outcome:
     robot, source = task.robot, task.source
-    with fetched(source.url) as path:
-        inputs = rows.inputs_of(path)
-        content = rows.content_hash([each.sha256 for each in inputs], source.session)
-        if content in task.known:
-            return Outcome(known=task.known[content])
-        chain, settings = robot.chain, robot.settings
-        if path.suffix.lower() in TABLES:  # anything else is a bag
-            sessions = (source.session,) if source.session else ()
-            loaded = of_table(table(path, chain, settings, sessions), chain, settings)
-        else:
-            session = CalibrationSession(chain, settings)
-            loaded = of_bag(session, replay(path, session), robot.largest_loss)
-        problem, result = loaded.problem, loaded.identified(settings.model)
-        time_of = measured_at(problem.all_sets, source.modified)
-        known = (content, robot.settings_hash, source.name, source.fingerprint)
-        about = rows.Filing(robot.serial, time_of, *known)
-        row = rows.identified(result, about, loaded.warnings)
-        if not task.page:
-            return Outcome(row)
-        configuration = configuration_yaml(chain.name, settings)
-        origin = Origin(inputs, serial=robot.serial, settings=configuration)
-        wanted = None if robot.tolerance is None else 1e-3 * robot.tolerance
-        poses = poses_of(problem, result, loaded.by_line)
-        report = identification_report(problem, result, poses, origin, loaded.warnings, wanted)
-        return Outcome(row, page=render(report, f'../../{PLOTLY}') or '')
+    inputs = rows.inputs_of(path)
+    content = rows.content_hash([each.sha256 for each in inputs], source.session)
+    if content in task.known:
+        return Outcome(known=task.known[content])
+    chain, settings = robot.chain, robot.settings
+    if path.suffix.lower() in TABLES:  # anything else is a bag
+        sessions = (source.session,) if source.session else ()
+        loaded = of_table(table(path, chain, settings, sessions), chain, settings)
+    else:
+        session = CalibrationSession(chain, settings)
+        loaded = of_bag(session, replay(path, session), robot.largest_loss)
+    problem, result = loaded.problem, loaded.identified(settings.model)
+    warnings = _named(task, path, loaded.warnings)
+    time_of = measured_at(problem.all_sets, source.modified)
+    known = (content, robot.settings_hash, source.name, source.fingerprint)
+    row = rows.identified(result, rows.Filing(robot.serial, time_of, *known), warnings)
+    if not task.page:
+        return Outcome(row)
+    configuration = configuration_yaml(chain.name, settings)
+    origin = Origin(inputs, serial=robot.serial, settings=configuration)
+    wanted = None if robot.tolerance is None else 1e-3 * robot.tolerance
+    poses = poses_of(problem, result, loaded.by_line)
+    report = identification_report(problem, result, poses, origin, warnings, wanted)
+    return Outcome(row, page=render(report, f'../../{PLOTLY}') or '')
 
 
 @contextmanager

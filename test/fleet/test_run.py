@@ -262,6 +262,20 @@ def test_tables_in_an_archive_have_its_dates(plant, tmp_path):
     assert [each.modified for each in found] == [dated, None]
 
 
+def test_a_fetched_file_is_told_by_its_name_not_that_of_the_copy(plant, cluster, tmp_path):
+    head, *rows = plants.night(*plants.robot(0)).splitlines()
+    with zipfile.ZipFile(tmp_path / 'nights.zip', 'w') as archive:
+        archive.writestr('a.csv', '\n'.join([f'{head},odd', *(f'{row},7' for row in rows)]))
+        archive.writestr('b.csv', 'q1\n')
+    urls = [f'zip://{name}.csv::file://{tmp_path}/nights.zip' for name in 'ab']
+    robot = replace(plant[0], measured=tuple(map(Pattern, urls)))
+    history = History(tmp_path / 'history')
+    (error,) = run((robot,), history, cluster).errors['A'].values()
+    assert error.startswith(f'{urls[1]} has no ')
+    (row,) = history.rows('A')
+    assert any(said.startswith(f'{urls[0]}: columns not read: odd') for said in row.remarks)
+
+
 def test_a_store_that_fails_costs_its_pattern_only(plant, tmp_path, monkeypatch):
     (tmp_path / 'nights/A/bag').mkdir()
     known = LocalFileSystem.isdir
