@@ -19,7 +19,8 @@ it a normal variable z, independent of earlier ones. Two cumulative sums (CUSUM;
 
 detect shifts of about 2 k: a small k slow changes, a large one jumps. S > h raises an alarm. The
 mean number of nights until a false alarm follows from a discretised Markov chain of S (Brook and
-Evans 1972); each chart gets half of the wanted rate. Both restart after an alarm.
+Evans 1972); each chart gets half of the wanted rate. Both restart after an alarm, and where errors
+have fallen as clearly, as after a new calibration: the same sums of -z.
 """
 
 from __future__ import annotations
@@ -128,19 +129,25 @@ def drift(rms: Sequence[float], freedom: Sequence[float], years: float) -> Drift
     shares = np.zeros((len(errors), len(SLOPES)))
     alarms, since = [], []
     squares = known = 0.0
-    sums, starts = np.zeros(len(SLOPES)), np.zeros(len(SLOPES), dtype=int)
+    sums, fallen = np.zeros(len(SLOPES)), np.zeros(len(SLOPES))
+    starts = np.zeros(len(SLOPES), dtype=int)
     for night, (error, nu) in enumerate(zip(errors.tolist(), nus.tolist(), strict=True)):
         if known:
             ratio = error**2 / (squares / known)
-            chance = max(float(special.fdtrc(nu, known, ratio)), 1e-300)
+            z = -special.ndtri(max(float(special.fdtrc(nu, known, ratio)), 1e-300))
             starts = np.where(sums > 0.0, starts, night)
-            sums = np.maximum(0.0, sums - special.ndtri(chance) - np.array(SLOPES))
+            sums = np.maximum(0.0, sums + z - np.array(SLOPES))
+            fallen = np.maximum(0.0, fallen - z - np.array(SLOPES))
             shares[night] = sums / limits
-            if (shares[night] > 1.0).any():
+            if grown := bool((sums > limits).any()):
                 alarms.append(night)
                 since.append(int(starts[np.argmax(shares[night])]))
+            better = bool((fallen > limits).any())
+            if grown or better:
                 squares = known = 0.0
-                sums[:] = 0.0
+                sums[:] = fallen[:] = 0.0
+            if better:  # a night chosen for its small error would make later ones large
+                continue
         squares, known = squares + nu * error**2, known + nu
     return Drift(shares, tuple(alarms), tuple(since))
 

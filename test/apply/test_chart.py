@@ -40,6 +40,15 @@ def test_an_arm_that_gets_worse_is_found(growth, within):
     assert np.mean(late) <= within
 
 
+def test_errors_that_grow_after_a_better_calibration_are_found():
+    """They were compared with those of the worse calibration before it, too."""
+    rng = np.random.default_rng(3)
+    rms = np.repeat([1.0, 0.2, 0.5], [20, 10, 5]) * np.sqrt(rng.chisquare(30.0, 35) / 30.0)
+    found = drift(rms, np.full(35, 30.0), 100.0)
+    assert (found.alarms, found.since) == ((30,), (30,))
+    assert drift(rms[:30], np.full(30, 30.0), 100.0).alarms == ()
+
+
 def test_what_are_no_errors_is_refused():
     for rms, freedom in (([0.1, -0.1], [3.0, 3.0]), ([0.1], [3.0, 3.0]), ([0.1], [0.0])):
         with pytest.raises(InputError, match='degrees of freedom of nights'):
