@@ -26,10 +26,18 @@ import numpy as np
 from scipy import special
 
 from calib_ros.estimation.leastsquares import PATIENCE, STEP_TOLERANCE, Fit, System, minimise
-from calib_ros.estimation.levels import ALIKE, SURE
+from calib_ros.estimation.levels import ALIKE, LEAST_ASIDE, NEARER, SURE
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDS, Flags, FloatArray, norms
+from calib_ros.kinematics.se3 import (
+    HALF_THE_DIGITS,
+    ROUNDING,
+    ROUNDS,
+    Flags,
+    FloatArray,
+    Index,
+    norms,
+)
 
 Loss: TypeAlias = Literal['redescending', 'huber', 'none']
 LOSSES: tuple[str, ...] = get_args(Loss)
@@ -88,8 +96,31 @@ def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) 
     another = sums[0] > ALIKE**2 * sums[1]
     spare = system.rows - unknown(names, system)
     if another and chance_of_outliers(second, first.fit.chain, names, system, spare) < 1.0 - SURE:
-        return second
-    return first
+        first = second
+    return _with_explained(first, names, system)
+
+
+def _with_explained(found: Robust, names: Sequence[str], system: System) -> Robust:
+    """Return a fit with the samples left out, if that explains most of them at a small price.
+
+    What the model lacks looks like gross errors at the only poses in a part of the joint range, if
+    the others decide alone. Gross errors keep their residuals in any fit, or spoil the others'.
+    """
+    out = found.outliers
+    if out.sum() < LEAST_ASIDE:
+        return found
+    plain = minimise(found.fit.chain, names, system)
+    bounded = reweighted(plain.chain, names, system, 'huber')
+    before, after = (_squares(robust.fit.chain, system) for robust in (found, bounded))
+    share = max(1.0 - unknown(names, system) / system.rows, ROUNDING)
+    price = np.sqrt(after[~out].sum() / max(before[~out].sum(), ROUNDING)) / share
+    left = price * np.sqrt(after / np.maximum(before, ROUNDING))
+    if np.median(left[out]) > NEARER:
+        return found
+    nearer = np.where(out & (left < NEARER), INNER, np.inf)
+    return reweighted(
+        bounded.fit.chain, names, system, found.loss, np.split(nearer, _ends(system))
+    )
 
 
 def chance_of_outliers(
@@ -153,7 +184,7 @@ def reweighted(
     distances (N,) of all samples by a `simpler` model, samples that it explains are no gross
     errors: a richer model has to explain them too.
     """
-    ends = np.cumsum([samples.count for samples in system.sets])[:-1]
+    ends = _ends(system)
 
     def judged(chain: Chain) -> FloatArray:  # over all sets
         found = np.concatenate(distances_of(chain, names, system))
@@ -252,12 +283,22 @@ def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
 
 def trimmed_sum(chain: Chain, system: System) -> float:
     """Return the sum of the shorter half of the squared residuals of every set, in sigma."""
-    total = 0.0
+    sets = np.split(_squares(chain, system), _ends(system))
+    return float(sum(np.sort(each)[: (len(each) + 1) // 2].sum() for each in sets))
+
+
+def _ends(system: System) -> Index:
+    """Return where the samples of all sets but the last end."""
+    return np.cumsum([samples.count for samples in system.sets])[:-1]
+
+
+def _squares(chain: Chain, system: System) -> FloatArray:
+    """Return the squared residuals (N,) of the samples of all sets, in sigma."""
+    found = []
     for samples in system.sets:
         parts = [np.nan_to_num(part) for part in samples.whitened_residuals(chain)]
-        squares = np.sort(sum((part**2).sum(axis=1) for part in parts))
-        total += float(squares[: (samples.count + 1) // 2].sum())
-    return total
+        found.append(sum((part**2).sum(axis=1) for part in parts))
+    return np.concatenate(found)
 
 
 def unknown(names: Sequence[str], system: System) -> int:
