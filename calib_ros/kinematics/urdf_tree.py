@@ -209,8 +209,8 @@ def _robot(text: str) -> ET.Element:
         raise ConfigError('this is a xacro file, not a URDF: run "xacro FILE > robot.urdf" first')
     if root.tag != 'robot':
         raise ConfigError(
-            f'a URDF has the root element <robot>, not <{root.tag}>: convert it to a URDF, or write '
-            'a chain file (calib_ros chain ur10e prints one)'
+            f'a URDF has the root element <robot>, not <{root.tag}>: convert it to a URDF, or '
+            'write a chain file (calib_ros chain ur10e prints one)'
         )
     return root
 
