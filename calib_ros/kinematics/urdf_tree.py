@@ -208,10 +208,7 @@ def _robot(text: str) -> ET.Element:
     if any('xacro:' in element.tag for element in root.iter()):
         raise ConfigError('this is a xacro file, not a URDF: run "xacro FILE > robot.urdf" first')
     if root.tag != 'robot':
-        raise ConfigError(
-            f'a URDF has the root element <robot>, not <{root.tag}>: convert it to a URDF, or '
-            'write a chain file (calib_ros chain ur10e prints one)'
-        )
+        raise ConfigError(f'a URDF has the root element <robot>, not <{root.tag}>: convert it')
     return root
 
 
