@@ -141,14 +141,22 @@ def drawn(
 def independent_in(rows: Sequence[FloatArray], names: Sequence[str]) -> tuple[str, ...]:
     """Return the parameters that rows (R, P) at arbitrary poses determine."""
     lens = [k for k, name in enumerate(names) if Parameter(name).of_lens]
-    every = np.concatenate([*rows, np.eye(len(names))[lens]])
-    first = np.asarray(np.linalg.qr(every, mode='r'))
+    every = [*map(_compact, rows), np.eye(len(names))[lens]]
+    first = np.asarray(np.linalg.qr(np.concatenate(every), mode='r'))
     least = [HALF_THE_DIGITS if Parameter(n).kind in FRAME_KINDS else EXCEPTION for n in names]
     strong = independent(first, names, np.array(least))
     order = sorted(range(len(names)), key=lambda k: names[k] not in strong)
     factor = np.asarray(np.linalg.qr(first[:, order], mode='r'))
     found = independent(factor, [names[k] for k in order])
     return tuple(name for name in names if name in found)
+
+
+def _compact(rows: FloatArray) -> FloatArray:
+    """Return R (K, P) with the products of rows (R, P), of which some columns are zero."""
+    used = np.flatnonzero(rows.any(axis=0))
+    factor = np.zeros((min(len(rows), len(used)), rows.shape[1]))
+    factor[:, used] = np.linalg.qr(rows[:, used], mode='r')
+    return factor
 
 
 def identifiable_and_held(

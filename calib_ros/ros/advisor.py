@@ -8,7 +8,7 @@
 
 All is computed on one separate thread, in pieces, while messages are taken. On one core the next
 pose takes about 15 ms, the cloud 0.3 s, 10,000 points of a trajectory 0.1 s, and 0.3 s with
-velocities; the estimate 0.02 s, and a second with fifty targets.
+velocities; the estimate 0.02 s, and half a second with fifty targets.
 """
 
 from __future__ import annotations

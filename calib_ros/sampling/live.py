@@ -3,7 +3,7 @@
 """The estimate during sampling: what is known so far, and how many more samples are needed.
 
 It is the robust fit (`robust.py`) to the samples so far, or to some of them if they are many. Wide
-priors stand for what no sample has determined yet. A fit takes 0.02 s, half a second with thirty
+priors stand for what no sample has determined yet. A fit takes 0.02 s, 0.3 s with thirty
 targets.
 """
 
