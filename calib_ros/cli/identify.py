@@ -45,6 +45,7 @@ PAGES = ('report.html', 'report.md', 'residuals.csv', 'before_after.png')
 RESULT_FILES = ('calibration.yaml', 'result.json', 'settings.yaml', *PAGES)
 REPORTS = (*PAGES, 'report.pdf')
 UNCHANGED = f'{reports.NOT_YET}: {reports.BRING}'
+STAYS = 'the arm is unchanged within the uncertainty: the correction that it has stays valid'
 NOT_OF_UPDATES = ('history', 'tolerance', 'pdf', 'model', 'fixed', 'priors', 'folds')
 
 
@@ -136,14 +137,14 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
     why, step = found.refusal()
     if why:
         screen.bullet(why, (step,))
-    elif not found.changed:
-        screen.bullet('unchanged within the uncertainty')
     if found.accepted or not (found.determined or found.odd):
         perhaps = 'perhaps ' if why else ''
         for reasons in found.changed:
             screen.bullet(perhaps + reason_in_words(reasons))
     if found.accepted:
-        screen.bullet(UNCHANGED)
+        names = (name for reasons in found.changed for each in reasons for name in each.names)
+        same = all(map(found.calibration.chain.owns_frame, names))
+        screen.bullet(STAYS if same else UNCHANGED)
 
 
 def _intervals(judged: Comparison | None) -> str:

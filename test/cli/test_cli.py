@@ -362,3 +362,16 @@ def test_one_gross_pose_leaves_no_doubt_about_the_arm(run, written, tmp_path):
     assert 'Perhaps changed' not in out
     write_csv(tmp_path / 'new.csv', rows[:7] + rows[8:])
     assert run(*given)[0] == 0
+
+
+@pytest.mark.parametrize('moved', [0.0, 2e-3])
+def test_an_unchanged_arm_needs_no_other_correction(run, written, tmp_path, moved):
+    rows = rows_of(measured(seed=25, count=10), 0)
+    for row in rows:
+        row['x'] += moved
+    write_csv(tmp_path / 'new.csv', rows)
+    status, out, _ = run('identify', 'new.csv', '--chain', 'ur5e', '--previous', written[0])
+    assert status == 0
+    assert ('Changed: base' in out) == (moved > 0.0)
+    assert 'the correction that it has stays valid' in ' '.join(out.split())
+    assert 'calib_ros export' not in out
