@@ -32,9 +32,9 @@ def some(words: Sequence[str], most: int = NAMED) -> list[str]:
 
 
 def rounded(value: float) -> str:
-    """Return a value with three decimals, more if two digits need them, or none from 1e4 on."""
-    if math.isfinite(value) and abs(value) >= 1e4:
-        return f'{value:,.0f}'
+    """Return a value with three decimals, more if two digits need them, or none from 1e3 on."""
+    if math.isfinite(value) and abs(value) >= 1e3:
+        return f'{value:{"," * (abs(value) >= 1e4)}.0f}'  # 1,210 may be read as 1.210
     digits = 1 - math.floor(math.log10(abs(value))) if value and math.isfinite(value) else 0
     return f'{value:.{max(3, digits)}f}'
 

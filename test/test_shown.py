@@ -245,7 +245,13 @@ def test_without_pandas_that_is_said(monkeypatch):
 
 @pytest.mark.parametrize(
     ('value', 'text'),
-    [(0.0, '0.000'), (0.00123, '0.0012'), (281.7194, '281.719'), (127275.477, '127,275')],
+    [
+        (0.0, '0.000'),
+        (0.00123, '0.0012'),
+        (281.7194, '281.719'),
+        (127275.477, '127,275'),
+        (1210.0, '1210'),
+    ],
 )
 def test_numbers_have_the_digits_that_a_reader_needs(value, text):
     assert rounded(value) == text

@@ -81,10 +81,10 @@ def between(judged: Comparison | None, when: int) -> str:
 
 
 def interval_mm(lower: float, upper: float) -> str:
-    """Return an interval [mm] with as many decimals at both ends."""
+    """Return an interval [mm] with as many decimals at both ends, if the upper one has any."""
     end = rounded(upper)
     decimals = len(end.partition('.')[2])
-    return f'{lower:{"" if decimals else ","}.{decimals}f} to {end}'
+    return f'{f"{lower:.{decimals}f}" if decimals else rounded(lower)} to {end}'
 
 
 def limits_mm(judged: Comparison | None, when: int) -> list[float] | None:

@@ -194,7 +194,12 @@ def test_no_figure_is_rounded_to_nothing():
 
 @pytest.mark.parametrize(
     ('limits', 'said'),
-    [([0.00899, 0.0131], '0.009 to 0.013'), ([4e-4, 6e-4], '0.00040 to 0.00060'), (None, '')],
+    [
+        ([0.00899, 0.0131], '0.009 to 0.013'),
+        ([4e-4, 6e-4], '0.00040 to 0.00060'),
+        ([0.43, 2791.488], '0.430 to 2791'),
+        (None, ''),
+    ],
 )
 def test_the_limits_of_an_interval_have_the_same_decimals(monkeypatch, limits, said):
     monkeypatch.setattr(words, 'limits_mm', lambda *_: limits)
