@@ -52,7 +52,7 @@ MOVED = """\
 LAYOUT = """\
 tables of other systems (docs/tables.md); anything not given is guessed
   --preset NAME=  layout: a name, or your own .yaml
-  --length UNIT=  unit of lengths: m, cm, mm, um, in
+  --length UNIT=  unit of lengths: m, cm, mm, um, in, ft
   --angle UNIT=  unit of angles, including joint values: rad, deg
   --joint-angle UNIT=  unit of joint values, if different
   --euler ZYX=  rx ry rz are Euler angles; zyx: fixed axes
