@@ -85,7 +85,7 @@ def _run_history(options: argparse.Namespace, screen: Screen) -> int:
         if options.robot not in serials:
             raise UnknownNameError('robot', options.robot, serials)
         serials = (options.robot,)
-    width = max(map(len, serials))
+    width = max(map(len, ('robot', *serials)))
     columns = 'time (UTC)        what      verdict        poses  RMS [mm]  from'
     screen.data(f'{"robot":{width}}  {columns}')
     status = 0
