@@ -226,7 +226,8 @@ def _order(problem: Problem) -> str:
             names = ', '.join(problem.chain.joint_names[k] for k in steady)
             return (
                 f'drift of the device looks like an error of {names}, moved in one direction from '
-                'the first pose to the last: next time mix the order of the poses'
+                'the first pose to the last: measure the first pose again, to see whether the '
+                'device drifts, and next time mix the order of the poses'
             )
     return ''
 
