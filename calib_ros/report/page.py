@@ -223,11 +223,11 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
     lines += _paragraphs(verdict.gain, *verdict.text)
     for reason in report.advice:
         lines += _section(reason.heading, reason.meaning, f'What was found: {reason.refusal}')
-        lines += _listed(reason.steps) if reason.steps else []
+        lines += _numbered(reason.steps) if reason.steps else []
     if report.advice:
         lines += _paragraphs(*report.steps)
     elif report.steps:
-        lines += [*_section('What to do next'), *_listed(report.steps)]
+        lines += [*_section('What to do next'), *_numbered(report.steps)]
     if report.remarks:
         lines += [*_section('Please note'), *_listed(report.remarks)]
     for each in (report.accuracy, report.picture, *report.sections):
@@ -255,6 +255,10 @@ def _paragraphs(*text: str) -> list[str]:
 
 def _listed(points: Iterable[str]) -> list[str]:
     return [*(f'- {in_markdown(each)}' for each in points), '']
+
+
+def _numbered(steps: Iterable[str]) -> list[str]:
+    return [*(f'{k}. {in_markdown(each)}' for k, each in enumerate(steps, 1)), '']
 
 
 def _row(cells: Iterable[str]) -> str:

@@ -185,19 +185,19 @@ def _steps(
     lower, upper = interval_of(result.validation or result.fitted, 1)
     beyond = tolerance is not None and lower > tolerance
     undecided = tolerance is not None and lower <= tolerance < upper
+    whole = result.region is None or result.region.whole
     found = {
-        'First check what is named above. If it is true, remove the cause and identify again.': (
-            bool(result.remarks)
-        ),
+        'First check what is named above. If it is true, remove the cause and identify '
+        'again.': bool(result.remarks),
         sentence(CLOSER): may_be_closer(result, beyond),
         'Compare the remaining error with the accuracy of the measuring device: no calibration '
         'gets below that.': beyond,
         f'Measure more poses to decide on the tolerance, {SPREAD_OUT}.': undecided,
         sentence(BRING): True,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
-        'arm: calib_ros verify.': True,
-        'To use it beyond the measured poses, measure there too: calib_ros compensate refuses '
-        'poses where it is not valid.': result.region is not None and not result.region.whole,
+        'arm: calib_ros verify.': whole,
+        'Then measure at least five new poses near these and judge the corrected arm: calib_ros '
+        'verify. To use it elsewhere, measure there too and identify again.': not whole,
     }
     return tuple(step for step, needed in found.items() if needed)
 

@@ -19,7 +19,7 @@ from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.report import reports
-from calib_ros.report.page import Origin, markdown
+from calib_ros.report.page import Origin, markdown, with_code
 from calib_ros.report.plots import before_after_png
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
@@ -144,3 +144,10 @@ def test_a_journal_keeps_the_names_of_messages(tmp_path, name):
     with path.open(newline='') as file:
         _, row = csv.reader(file)
     assert not any(cell.startswith(('=', '+', '-', '@', '\t', '\r')) for cell in row)
+
+
+def test_no_line_ends_between_a_bracket_and_its_code():
+    found = with_code('fit (--session A,B), (or --force) (--new-base)')
+    for code in ('--session A,B', '--new-base'):
+        assert f'<span class="whole">(<code>{code}</code></span>' in found
+    assert found.count('whole') == 2
