@@ -12,14 +12,17 @@ from pathlib import Path
 from calib_ros.files.vocabulary import (
     IN_TURN,
     MATRIX,
+    NUMBERS,
     POSITION,
     QUATERNION,
     TURNS,
     joint_columns,
 )
 
-WORD = re.compile(r'[^\W\d_A-Z]+|[A-Z][^\W\d_A-Z]+|[A-Z]+(?![a-z])|[0-9]+')
-"""Words of a name: `X_meas`, `pose.position.x`, `dX`, `Nominal X`."""
+WORD = re.compile(r'[\u3040-\u9fff]+|[A-Z]?[^\W\d_A-Z\u3040-\u9fff]+|[A-Z]+(?![a-z])|[0-9]+')
+"""Words of a name: `X_meas`, `pose.position.x`, `dX`, `Nominal X`, `X実測`."""
+JOINED = re.compile(r'([xyzw])([^\W\d_]+)|([^\W\d_]+)([xyzw])', re.I)
+"""An axis and the rest of a name in one word: `Xact`, `Actualx`, `XM`."""
 CORNER = re.compile(r'(\D*)([01])(\D*)\2(\D*)')
 """The name of the first number of a matrix."""
 SECOND_NAMES = re.compile(r'q[0-9]+[._ (]+[0-9]\)?', re.I)  # q1.1, as pandas names a second q1
@@ -34,12 +37,14 @@ def _set(words: str) -> frozenset[str]:
 
 MEASURED_WORDS = _set(
     'meas measured measurement act actual true truth ist istwert fbk feedback tracker leica laser '
-    'faro vicon gemessen mesuré mesurée misurato misurata medido medida réel réelle reale'
+    'faro vicon gemessen mesuré mesurée misurato misurata medido medida réel réelle reale '
+    '実測 実測値 測定値 实测 测量'
 )
 NOMINAL_WORDS = _set(
     'nom nominal cmd command commanded target soll sollwert ref reference des desired goal '
     'setpoint theo theoretical ideal cad design model calc computed pred predicted sim simulated '
-    'prog programmed planned tcp ee robot fk théorique teorico teórico nominale consigne'
+    'prog programmed planned tcp ee robot fk théorique teorico teórico nominale consigne ziel '
+    'vorgabe 設計値 理論値 指令値 理论'
 )
 NOMINAL_TITLES = NOMINAL_WORDS - _set(
     'target robot tcp ee model ref reference design prog fk goal planned theo'
@@ -89,6 +94,9 @@ def groups(
     for name in header:
         words = words_of(name)
         axis = [word for word in words if word in 'xyzw']
+        if not axis and name not in NUMBERS and (joined := JOINED.fullmatch(name)):
+            axis = [(joined[1] or joined[4]).lower()]
+            words = [*axis, *words_of(joined[2] or joined[3])]
         if len(axis) == 1 and header.count(name) == 1 and not without & {*words} - {*axis}:
             found.setdefault(frozenset(words) - {*axis}, {}).setdefault(axis[0], name)
     return {w: [each[a] for a in axes] for w, each in found.items() if {*axes} <= {*each}}

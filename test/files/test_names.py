@@ -62,6 +62,10 @@ def proposed(path, said='.*'):
         ('{} teórico', '{} medido'),
         ('{}', '{}_true'),
         ('{}_corr', '{}_true'),
+        ('{}', '{}meas'),
+        ('{}', '{}M'),
+        ('{}', '{}測定値'),
+        ('{}nom', '{}act'),
     ],
 )
 @pytest.mark.parametrize('joints', [['q1', 'q2'], ['J1', 'J2']])
@@ -107,7 +111,12 @@ def test_plain_coordinates_may_be_nominal_beside_any_others(tmp_path, form, ours
     given = [*NAMES[:2], *ours, *names(form)]
     path.write_text(text_of(JOINTS, NOMINAL, PLACES, names=given))
     assert_same(proposed(path, 'if they were measured'), None)
-    for other in ('{}_nom', 'n{}', 'e{}'):  # others tell what the plain ones are, or are no places
+    for other in (
+        '{}_nom',
+        'Ziel {}',
+        'n{}',
+        'e{}',
+    ):  # others tell what the plain ones are, or are no places
         given = [*NAMES[:2], *ours, *names(other)]
         path.write_text(text_of(JOINTS, PLACES, NOMINAL, names=given))
         assert_same(loading.table(path, ARM, Settings()), None)
