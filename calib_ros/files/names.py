@@ -36,9 +36,9 @@ def _set(words: str) -> frozenset[str]:
 
 
 MEASURED_WORDS = _set(
-    'meas measured measurement act actual true truth ist istwert fbk feedback tracker leica laser '
-    'faro vicon gemessen mesuré mesurée misurato misurata medido medida réel réelle reale '
-    '実測 実測値 測定値 实测 测量'
+    'meas measured measurement act actual true truth ist istwert fb fbk feedback enc encoder obs '
+    'observed real mes mess tracker leica laser faro vicon gemessen mesuré mesurée '
+    'misurato misurata medido medida réel réelle reale 実測 実測値 測定値 实测 测量 实际'
 )
 NOMINAL_WORDS = _set(
     'nom nominal cmd command commanded target soll sollwert ref reference des desired goal '
@@ -59,8 +59,8 @@ DEVIATION = _set('d dev deviation delta dif diff difference abw abweichung')
 TURNED = _set('q quat quaternion orientation rot rotation')
 DISTANCE_WORDS = _set('distance length wire abstand')
 JOINT_WORDS = _set(
-    'q j a joint joints axis achse axe position pos theta th angle winkel gelenk eje asse giunto '
-    'articulation articulación junta eixo'
+    'q j a enc encoder joint joints axis achse axe position pos theta th angle winkel gelenk eje '
+    'asse giunto articulation articulación junta eixo'
 )
 NO_JOINT = _set(
     'vel velocity speed qd acc acceleration qdd force torque moment tau effort load currents '
@@ -81,9 +81,13 @@ ROTATIONS: dict[tuple[str, ...], tuple[tuple[str, ...], str]] = {
 
 
 def words_of(name: str) -> list[str]:
-    """Return the words of a name in small letters; `dx` and `QX` are two."""
+    """Return the words of a name in small letters; `dx`, `QX` and `qact` are two."""
     words = [word.lower() for word in WORD.findall(name)]
-    return [part for w in words for part in (w if re.fullmatch('[a-z][xyzw]', w) else (w,))]
+    words = [part for w in words for part in (w if re.fullmatch('[a-z][xyzw]', w) else (w,))]
+    told = MEASURED_WORDS | NOMINAL_WORDS
+    return [
+        part for w in words for part in (('q', w[1:]) if w[0] == 'q' and w[1:] in told else (w,))
+    ]
 
 
 def groups(
