@@ -33,11 +33,13 @@ DASK = {
     'distributed.admin.tick.interval': '1s',
     'distributed.admin.system-monitor.interval': '2s',
     'distributed.worker.memory.monitor-interval': '500ms',
+    'distributed.worker.memory.pause': False,
     'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': 2**28,
     'distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_': 2**25,
 }
 """Settings of dask: less self-monitoring, which costs more than its work; workers keep freed
-memory [bytes], because getting it back costs a third of a large task's time."""
+memory [bytes], because getting it back costs a third of a large task's time, so one near its limit
+must not pause until it has less."""
 
 
 class LostError(CalibrationError):
@@ -255,5 +257,6 @@ def _done(
         if future.status in ('cancelled', 'lost'):
             raise LostError('the scheduler is lost: results so far are saved; run again')
         if future.status == 'error':
-            outcome = Outcome(error=f'its worker ended: {shortened(str(future.exception()))}')
+            ended = 'its worker ended, perhaps beyond its memory (--memory)'
+            outcome = Outcome(error=f'{ended}: {shortened(str(future.exception()))}')
         yield of[future.key], outcome

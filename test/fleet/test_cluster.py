@@ -19,6 +19,7 @@ import pytest
 
 from calib_ros.cli.main import main
 from calib_ros.files.history import History
+from calib_ros.fleet.run import Cluster, _client
 
 DASK = Path(sys.executable).with_name('dask')
 ONE = ('--nworkers', '1', '--nthreads', '1')
@@ -99,3 +100,13 @@ def test_whatever_is_killed_each_result_is_filed_once_and_no_copy_is_left(served
     assert sorted(frame.key) == sorted(row.key for row in rows)
     assert rows[0].source.endswith('bags/A')
     assert rows[1].source.startswith('zip://nights/B/000.csv::file://')
+
+
+def test_a_worker_near_its_limit_does_not_pause_for_ever():
+    """It keeps freed memory: of a table too large for it a run waited without an end."""
+
+    def paused(dask_worker):
+        return dask_worker.memory_manager.memory_pause_fraction
+
+    with _client(Cluster(workers=1)) as client:
+        assert {*client.run(paused).values()} == {False}
