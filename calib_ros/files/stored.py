@@ -27,6 +27,7 @@ from calib_ros.files import mcap
 from calib_ros.files.unpacked import recorded_files
 from calib_ros.sampling.batches import Stream
 from calib_ros.sampling.messages import PICTURES
+from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, parse_yaml, read_text
 
 if TYPE_CHECKING:
@@ -74,7 +75,9 @@ def check_bag(path: Path) -> None:
     elif not recorded_files(path):
         convert = f'rosbags-convert --src {shlex.quote(str(path))} --dst FOLDER'
         older = f'; a bag of ROS 1 is converted by {convert}' if path.suffix == '.bag' else ''
-        raise ValueError(f'no .mcap or .db3 file is in it{older}')
+        files = sorted(each.name for each in path.iterdir()) if path.is_dir() else []
+        only = f', only {", ".join(some(files, 3))}' if files else ''
+        raise ValueError(f'no .mcap or .db3 file is in it{only}{older}')
     for file in recorded_files(path):
         if file.suffix == '.db3':
             with closing(_open(file)) as connection:

@@ -29,7 +29,7 @@ def bad_inputs():
     swapped = 'order.csv is of other joints: q1 is elbow_joint, in the chain shoulder_pan_joint; '
     yield 'a journal of another order', (*csv_of, 'order.csv'), swapped
     yield 'no such bag', (*bag_of, 'missing'), 'no bag at missing'
-    yield 'an empty bag folder', (*bag_of, 'folder'), 'no .mcap or .db3 file is in it'
+    yield 'no bag folder', (*bag_of, 'folder'), '(no .mcap or .db3 file is in it, only notes)'
     yield 'a chain as table', (*bag_of, 'broken.yaml'), 'but identify takes a table or a bag'
     yield 'no such robot', (*chain_of, 'ur10x'), 'valid: abb_irb120'
     yield 'no chain', (*chain_of, 'good.csv'), 'good.csv is no chain file (.yaml) or URDF'
