@@ -136,9 +136,10 @@ class Identifying:
         try:
             problem = session.problem()
         except InputError as err:
-            self.earlier = ONE_BEFORE
             why = [] if session.samples else inputs.failures
-            raise InputError('; '.join((*why, str(err)))) from err
+            told = InputError('; '.join((*why, str(err))))
+            self._failed(told)
+            raise told from err
         samples = tuple(session.usable)
         origin = {
             'robot_serial': self._filer.serial,
@@ -162,15 +163,21 @@ class Identifying:
 
     def run(self, given: Snapshot) -> Answer:
         """Identify; publish only an accepted result."""
-        loaded, settings = given.loaded, given.settings
+        loaded = given.loaded
         self._advice = next(iter(loaded.warnings), '')  # if poses are too few
         try:
             with self.progress.running():
-                result = loaded.identified(settings.model, self.progress)
-        except Exception:
-            self.earlier = ONE_BEFORE
+                result = loaded.identified(given.settings.model, self.progress)
+            return self._judged(given, result)
+        except Exception as err:
+            self._failed(err)
             raise
-        self.earlier = '' if result.accepted else ONE_BEFORE
+
+    def _failed(self, err: Exception) -> None:
+        self.earlier, self.last = ONE_BEFORE, f'no result: {trouble(err)}'
+
+    def _judged(self, given: Snapshot, result: Identification) -> Answer:
+        loaded = given.loaded
         steps = (step for reason in advice_of(result) for step in reason.steps)
         telling = next((each.short for each in result.refusals if each.rule in TELLING_RULES), '')
         first = next(steps, '') if telling else given.cause or next(steps, '')
@@ -190,13 +197,15 @@ class Identifying:
             found = Calibration.of(result, given.origin, loaded.owners, loaded.problem.sets)
             published = Published(found.dump(), given.configuration, page)
             self._accepted(found, published, given.samples)
+            self.earlier = ''
             self.last += KEEP
         else:
+            self.earlier = ONE_BEFORE
             if self._session.calibration is not None:
                 self.last += '; the last good calibration stays in use'
             self._keep_report(page)
         row = partial(identified, result)
-        self.last += self._filer.file(lambda: loaded.problem, settings, row)
+        self.last += self._filer.file(lambda: loaded.problem, given.settings, row)
         return result.accepted, self.last
 
     def loaded(self, which: str) -> Answer:

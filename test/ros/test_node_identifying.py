@@ -9,14 +9,16 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
-from ros_cell import PATIENCE, STOPS, Cell, topics
+from ros_cell import PATIENCE, STOPS, Cell, topics, values_of
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from calib_ros.files import loading
 from calib_ros.files.history import History
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.ros.arguments import NODE
 from calib_ros.ros.boundary import InOrder
@@ -213,6 +215,19 @@ def test_an_identification_is_cancelled_between_stages(tmp_path, recording, stag
         for _ in range(100):
             release.put(None)
         cell.done('identify')
+
+
+def test_a_result_that_cannot_be_told_leaves_the_one_before(cell, recording, monkeypatch):
+    """It was taken for published: ~/save did not say that it saves another one."""
+    cell.play(topics(recording))
+    cell.done('identify')
+    good, heard = cell.node.session.calibration, cell.listen(DiagnosticArray, '/diagnostics', 10)
+    monkeypatch.setattr(Calibration, 'dump', None)
+    assert 'internal error' in cell.refused('identify').message
+    assert cell.node.session.calibration is good
+    assert cell.done('save').message.startswith(ONE_BEFORE)
+    said = "no result: 'NoneType' object is not callable"
+    cell.spin_until(lambda: heard and values_of(heard[-1])['last identification'] == said)
 
 
 @pytest.mark.parametrize('call', ['cancel', 'clear'])
