@@ -66,6 +66,13 @@ STANDINGS: dict[str, tuple[Headline, tuple[str, ...]]] = {
     ),
     'no verdict': (Headline('info', 'No verdict without a tolerance'), (TOLERANCE,)),
 }
+AT_THE_LIMIT = (
+    Headline('open', 'UNDECIDED: the error is as large as the limit'),
+    (
+        'More poses would hardly decide. Set a larger --tolerance if the task allows it; else '
+        'calibrate again with new poses, and try --model auto.',
+    ),
+)
 REUSED = (
     Headline('open', 'No verdict: the calibration was computed from these measurements'),
     (f'Measure new poses, {SPREAD_OUT}, and verify with those alone.',),
@@ -87,6 +94,8 @@ def standing(found: Verification) -> tuple[Headline, tuple[str, ...]]:
     if found.reused and found.verdict == 'no verdict':
         return REUSED
     state, steps = STANDINGS[found.verdict]
+    if found.verdict == 'UNDECIDED' and found.needed is None:
+        state, steps = AT_THE_LIMIT
     if not found.by_program:  # nor whether the correction reaches the arm
         state = replace(state, heading=state.heading.replace('the arm', 'the calibration'))
         steps = tuple(each for each in steps if each != ACTIVE)

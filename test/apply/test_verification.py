@@ -19,7 +19,7 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import invert
-from calib_ros.report.verdicts import _by_configuration
+from calib_ros.report.verdicts import _by_configuration, standing
 from calib_ros.shown import rounded
 
 _UNIT = ['(mean', '+', '3', 'sigma)']
@@ -121,9 +121,11 @@ def test_pass_fail_and_undecided(cell, arm, program):
     assert [each.verdict for each in found.values()] == ['FAIL', 'UNDECIDED', 'PASS']
     assert all(each.lower < rms < each.upper for each in found.values())
     assert found[1.0].needed is None  # exactly at the tolerance nothing decides
+    assert standing(found[1.0])[1][0].startswith('More poses would hardly decide')
     near = verify(arm, seen, 1.2 * rms)
     assert near.verdict == 'UNDECIDED'
     assert 5 < near.needed < 500
+    assert 'Measure more poses' in standing(near)[1][0]
     text = in_words(near)
     assert f'about {near.needed} poses' in text
     shown = near._repr_html_()
