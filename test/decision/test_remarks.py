@@ -23,7 +23,7 @@ from calib_ros.kinematics.lens import Lens
 
 
 @pytest.mark.parametrize(('joint', 'off'), [(2, 0.02), (2, 0.008), (0, 0.02)])
-def test_lengths_of_another_type_are_told(joint, off):
+def test_lengths_of_another_type_are_told(joint, off, unsearched):
     """As of an iiwa 14 whose chain is that of an iiwa 7; the zero of a rail may be anywhere."""
     rail = load_chain('ur10e_on_linear_axis')
     name = rail.joints[joint].parameters[0 if joint else 2]

@@ -41,7 +41,7 @@ def test_a_part_in_mm_is_named_between_new_frames_too(earlier, without_noise):
 
 @pytest.mark.parametrize('new', [(), ('base', 'tool')])
 @pytest.mark.parametrize('without_noise', [False, True])
-def test_two_positions_in_mm_update_nothing(earlier, without_noise, new):
+def test_two_positions_in_mm_update_nothing(earlier, without_noise, new, unsearched):
     """Between new frames the arm was moved by kilometres, or a traceback came."""
     few = seen(10, in_mm=2)
     with suppress(InputError):  # check their units

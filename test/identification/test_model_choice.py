@@ -54,7 +54,7 @@ def chosen(result):
 @pytest.mark.parametrize(
     ('group', 'size', 'seed'), [*(('eccentricity', 7e-4, k) for k in (0, 1)), ('gravity', 1e-2, 0)]
 )
-def test_effects_larger_than_usual_are_not_taken_for_noise(group, size, seed):
+def test_effects_larger_than_usual_are_not_taken_for_noise(unsearched, group, size, seed):
     """The first fit holds them at their usual size; what it leaves is no noise, then or later."""
     rng = np.random.default_rng(seed)
     names = effects.members(UR10E, group)
