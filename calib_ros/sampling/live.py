@@ -140,14 +140,11 @@ def _fitted(problem: Problem, samples: Sequence[Sample], count: int) -> Update:
     joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
     jacobian = ErrorModel(chain, names).jacobian(joints)[:, :3]
     variance = ((jacobian @ covariance) * jacobian).sum(axis=(1, 2))
-    groups = [[samples[k] for k in some] for some, _ in collect(samples, sigmas, Frames(), True)]
-    gross = [
-        sample
-        for members, near in zip(groups, good, strict=True)
-        for sample, fits in zip(members, near.tolist(), strict=True)
-        if not fits
-    ]
-    rms, ratio = _left(chain, problem.sets, groups, good, sigmas[0])
+    members = [np.array(some) for some, _ in collect(samples, sigmas, Frames(), posed=True)]
+    out = [some[~near] for some, near in zip(members, good, strict=True)]
+    gross = np.sort(np.concatenate(out)).tolist()
+    spreads = np.array([each.spread for each in samples])
+    rms, ratio = _left(chain, problem.sets, [spreads[some] for some in members], good, sigmas[0])
     estimate = Estimate(
         chain=chain,
         names=names,
@@ -158,7 +155,7 @@ def _fitted(problem: Problem, samples: Sequence[Sample], count: int) -> Update:
         rms=rms,
         excess=ratio if spare > len(names) else None,
     )
-    return Update(estimate, suspicious=tuple(gross))
+    return Update(estimate, suspicious=tuple(samples[k] for k in gross))
 
 
 def _priors(problem: Problem, names: Sequence[str]) -> Prior:
@@ -179,19 +176,18 @@ def _within(left: Sequence[FloatArray], sigmas: tuple[float, float]) -> Flags:
 def _left(
     chain: Chain,
     sets: Sequence[Observations],
-    groups: Sequence[Sequence[Sample]],
+    spreads: Sequence[FloatArray],
     good: Sequence[Flags],
     sigma: float,
 ) -> tuple[float, float]:
     """Return the RMS position residual [m], and in units of the measurement scatter."""
     squares, ratios = [], []
-    for each, members, near in zip(sets, groups, good, strict=True):
+    for each, spread, near in zip(sets, spreads, good, strict=True):
         left = residual_arrays(chain, each)[0]
         scatter = np.full(len(each), sigma**2)
         if each.covariance is not None:
             own = np.trace(each.covariance[:, :3, :3], axis1=1, axis2=2) / 3.0
             scatter = np.where(np.isnan(own), scatter, own)
-        spread = np.array([sample.spread for sample in members])
         squares.append((left**2).sum(axis=1)[near])
         ratios.append(((left**2).mean(axis=1) / np.maximum(scatter, spread**2))[near])
     first, second = (np.concatenate(found).mean() for found in (squares, ratios))

@@ -142,6 +142,16 @@ def test_several_devices_and_targets(rng):
     assert found.suspicious == ()
 
 
+def test_the_latest_sample_that_does_not_fit_comes_last(rng):
+    """It is the one that the status names, whichever device measured it."""
+    true = faulty(UR10E, Cell(), rng)
+    first, second = seen(true, 30, rng), seen(true, 30, rng, start=100, device='B')
+    first[25] = replace(first[25], position=first[25].position + 0.01)
+    second[20] = replace(second[20], position=second[20].position + 0.01)
+    samples = [each for pair in zip(first, second, strict=True) for each in pair]
+    assert learned(samples).suspicious == (second[20], first[25])
+
+
 def by_wire(samples, unit=1.0):
     """Return what a wire at the tracker's origin measures at the same stops."""
     ends = {'device': 'wire', 'position': None, 'rotation': None}
