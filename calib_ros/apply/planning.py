@@ -41,7 +41,7 @@ from calib_ros.estimation.identifiability import independent, indices_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Criterion
-from calib_ros.shown import Shown, as_frame
+from calib_ros.shown import Shown, as_frame, rounded
 
 INDICES: tuple[Criterion, ...] = ('o2', 'o3', 'o4', 'o5')
 
@@ -320,7 +320,7 @@ def fewest(
     best = predicted(excited.after(candidates), task)
     if best > wanted:
         raise InputError(
-            f'all {len(candidates)} candidates together predict {1e3 * best:.4f} mm, '
+            f'all {len(candidates)} candidates together predict {rounded(1e3 * best)} mm, '
             f'{1e3 * wanted:g} mm are wanted: give more candidates (--draw, --candidates), a '
             'more accurate device (--sigma-position), or a larger --accuracy'
         )
@@ -359,8 +359,8 @@ def accuracy_in_words(plan: Plan) -> list[str]:
     lines = [head, ' poses   planned   random']
     for number in shown.tolist():
         planned, random = (1e3 * each[number - 1] for each in (plan.accuracy, plan.at_random))
-        by_chance = f'{random:8.4f}' if np.isfinite(random) else '       -'
-        lines.append(f'{number:6} {planned:9.4f} {by_chance}')
+        by_chance = rounded(random) if np.isfinite(random) else '-'
+        lines.append(f'{number:6} {rounded(planned):>9} {by_chance:>8}')
     if not first:
         why = f'too few poses to determine all parameters: at least {plan.least} are needed'
         lines.append(f'{count:6}         - {why}')

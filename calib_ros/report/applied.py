@@ -18,7 +18,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, sections
 from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import numbers, unit_of
-from calib_ros.shown import rounded
+from calib_ros.shown import rounded, sentence
 
 BEYOND = 'To use the calibration beyond the measured poses, measure there too.'
 PLACE = 'To find the best place for a task: calib_ros workspace with --task FILE.'
@@ -143,7 +143,7 @@ def plan_report(
         shown.insert(0, Section('promise', 'Predicted accuracy', (about,), curve))
         known = bool(np.isfinite(found.accuracy[-1]))
         if known:
-            predicted = f'Predicted RMS position error: {1e3 * found.accuracy[-1]:.4f} mm.'
+            predicted = f'Predicted RMS position error: {rounded(1e3 * found.accuracy[-1])} mm.'
             verdict = replace(verdict, text=(*verdict.text, predicted))
         steps = (
             'Check for collisions, drive to each pose, wait until the arm is still, and measure.',
@@ -158,7 +158,7 @@ def plan_report(
         kind='Measurement plan',
         robot=chain.name,
         verdict=verdict,
-        remarks=tuple(remarks),
+        remarks=tuple(map(sentence, remarks)),
         steps=steps,
         identity=sections.identity_of(chain, origin),
         sections=tuple(shown),

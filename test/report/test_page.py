@@ -22,7 +22,7 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.files.rows import Input
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice, page
-from calib_ros.report.applied import workspace_report
+from calib_ros.report.applied import plan_report, workspace_report
 from calib_ros.report.documents import as_document
 from calib_ros.report.explorer import BANDS, SINGLE, WORST, explorer
 from calib_ros.report.page import Headline, Origin, markdown, render
@@ -393,3 +393,8 @@ def test_what_is_to_be_noted_comes_before_the_figures(solved):
     for text in (page_of(report).text, markdown(report, {})):
         assert text.index('What to do next') < text.index('a pose was hit')
         assert text.index('a pose was hit') < text.index('Accuracy before and after')
+
+
+def test_remarks_of_a_plan_are_sentences():
+    page = plan_report(UR, np.zeros((5, 6)), ['the tool is unknown'], Origin())
+    assert page.remarks == ('The tool is unknown.',)

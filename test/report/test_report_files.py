@@ -153,5 +153,5 @@ def test_the_other_commands_write_their_pages(solved, run, tmp_path):
     page = Page((tmp_path / 'plan.report.html').read_text())
     assert 'Poses to measure 12 poses. Predicted' in ' '.join(page.text.split())
     *_, last = page.data['figures']['promise']['data'][0]['y']
-    assert f'RMS position error: {last:.4f} mm' in page.text
+    assert f'RMS position error: {last:.3f} mm' in page.text
     assert run(*planned)[0] == 1
