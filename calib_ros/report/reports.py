@@ -214,7 +214,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
         figure=figures.against_noise(poses),
         said=(
             words.scatter_in_words(result.noise),
-            *_unmodelled(result),
+            *filter(None, (words.unmodelled_in_words(result),)),
             *(() if drift else (words.neighbours_in_words(result.noise),)),
             *map(words.chance_in_words, () if result.chance is None else (result.chance,)),
         ),
@@ -261,19 +261,6 @@ def _stated(problem: Problem, poses: Poses) -> str:
         for name, (measured, text) in found.items()
         if measured
     )
-
-
-def _unmodelled(result: Identification) -> list[str]:
-    """Return how far joints turn and tilt as no parameter explains; empty if they do not."""
-    lacking = result.posterior.unmodelled
-    seen = lacking.waves * lacking.shown  # else assumed
-    turn, tilt = 1e3 * lacking.turns, 1e3 * np.hypot(lacking.tilts, np.sqrt(2.0) * seen)
-    text = (
-        'Part of the remaining error seems to come from the arm and is not in the model, as if '
-        f'joints were off by {turn:.3f} mrad about their axes and {tilt:.3f} mrad across them '
-        '(one sigma). Expected errors include it.'
-    )
-    return [text] if turn + tilt else []
 
 
 def _effects(result: Identification) -> Section:

@@ -266,6 +266,21 @@ def scatter_in_words(noise: Noise) -> str:
     return f'{text} The intervals are widened accordingly.'
 
 
+def unmodelled_in_words(result: Identification) -> str:
+    """Return how far joints turn and tilt as no parameter explains; empty if they do not."""
+    lacking = result.posterior.unmodelled
+    seen = lacking.waves * lacking.shown  # else assumed
+    across = np.hypot(lacking.tilts, np.sqrt(2.0) * seen)
+    sizes = (1e3 * lacking.turns, 'about their axes'), (1e3 * across, 'across them')
+    off = ' and '.join(f'{size:.3f} mrad {way}' for size, way in sizes if round(size, 3))
+    come = 'may come' if result.noise.consistent else 'seems to come'
+    text = (
+        f'Part of the remaining error {come} from the arm and is not in the model, as if joints '
+        f'were off by {off} (one sigma). Expected errors include it.'
+    )
+    return text if off else ''
+
+
 def disturbed_in_words(noise: Noise) -> str:
     """Return that the device drifts, or far more is left than its noise; empty if neither."""
     if drifts(noise):

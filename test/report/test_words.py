@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
 from datetime import datetime, timezone
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -173,6 +174,35 @@ def test_poses_outside_the_region_do_not_lead_to_more_of_them():
     assert all(each[0].isupper() and each.endswith('.') for each in page.remarks)
     assert 'cycles' in page.sections[0].head
     assert not any('scatter' in each for each in page.sections[0].head)
+
+
+@pytest.mark.parametrize(
+    ('turns', 'tilts', 'consistent', 'said'),
+    [
+        (
+            0.0,
+            1.4e-5,
+            True,
+            'may come from the arm and is not in the model, as if joints were off '
+            'by 0.014 mrad across them (one',
+        ),
+        (
+            2e-5,
+            1.4e-5,
+            False,
+            'seems to come from the arm and is not in the model, as if joints '
+            'were off by 0.020 mrad about their axes and 0.014 mrad across them (one',
+        ),
+        (1e-8, 0.0, False, ''),
+    ],
+)
+def test_what_the_model_lacks_is_told_where_there_is_any(turns, tilts, consistent, said):
+    lacking = SimpleNamespace(turns=turns, tilts=tilts, waves=1.0, shown=0.0)
+    noise = Noise(1.03, None, consistent, 0.3, 0.2, ())
+    result = SimpleNamespace(posterior=SimpleNamespace(unmodelled=lacking), noise=noise)
+    told = words.unmodelled_in_words(result)
+    assert bool(told) == bool(said)
+    assert said in told
 
 
 def test_drift_is_errors_shared_in_succession_only():
