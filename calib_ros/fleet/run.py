@@ -9,6 +9,7 @@ is lost, only running tasks are lost; the next run repeats them.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -253,10 +254,29 @@ def _done(
     futures = client.map(work, tasks, pure=False)
     of = dict(zip((future.key for future in futures), tasks, strict=True))
     completed = as_completed(futures, client.loop, with_results=True, raise_errors=False)
-    for future, outcome in completed:
+    for future, outcome in _each(client, completed):
         if future.status in ('cancelled', 'lost'):
             raise LostError('the scheduler is lost: results so far are saved; run again')
         if future.status == 'error':
             ended = 'its worker ended, perhaps beyond its memory (--memory)'
             outcome = Outcome(error=f'{ended}: {shortened(str(future.exception()))}')
         yield of[future.key], outcome
+
+
+def _each(client: Any, completed: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield futures with their results as completed, unless all workers are gone meanwhile."""
+    last = time.monotonic()
+    while not completed.is_empty():
+        batch = completed.next_batch(block=False)
+        yield from batch
+        if batch:
+            last = time.monotonic()
+        elif time.monotonic() - last > ANSWER_S:
+            try:  # one that is restarted is back soon
+                client.wait_for_workers(1, timeout=ANSWER_S)
+            except (OSError, TimeoutError, RuntimeError) as err:
+                told = f'no workers are left: results so far are saved; run again: {err}'
+                raise LostError(told) from err
+            last = time.monotonic()
+        else:
+            time.sleep(0.02)

@@ -16,10 +16,13 @@ import pandas
 import plants
 import psutil
 import pytest
+from distributed import LocalCluster
 
 from calib_ros.cli.main import main
 from calib_ros.files.history import History
-from calib_ros.fleet.run import Cluster, _client
+from calib_ros.fleet.plant import read_plant
+from calib_ros.fleet.run import Cluster, LostError, _client, _done
+from calib_ros.fleet.tasks import SourceFile, Task
 
 DASK = Path(sys.executable).with_name('dask')
 ONE = ('--nworkers', '1', '--nthreads', '1')
@@ -110,3 +113,15 @@ def test_a_worker_near_its_limit_does_not_pause_for_ever():
 
     with _client(Cluster(workers=1)) as client:
         assert {*client.run(paused).values()} == {False}
+
+
+def test_a_run_whose_workers_are_all_gone_ends(tmp_path, monkeypatch):
+    """It waited without an end."""
+    (robot,) = read_plant(plants.write_plant(tmp_path, ['A'], 0))
+    monkeypatch.setattr('calib_ros.fleet.run.ANSWER_S', 1.0)
+    local = LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=None)
+    with local, _client(Cluster(local.scheduler_address)) as client:
+        local.scale(0)
+        until(lambda: not client.nthreads())
+        with pytest.raises(LostError, match='no workers are left'):
+            next(_done(client, [Task(robot, SourceFile('a'))]))
