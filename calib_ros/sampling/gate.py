@@ -64,16 +64,18 @@ class Gate:
         """Pass messages up to the first that must be held, or releases others."""
         times, numbers = given.times, np.arange(len(given))
         near = np.zeros(len(given), dtype=bool)  # to the last one of any kind
+        back = near.copy()
         for kind, which in ((JOINTS, given.joints), (POSES, ~given.joints)):
             before = np.maximum.accumulate(np.where(which, numbers, -1))
             before = np.concatenate([[-1], before[:-1]])
             known = np.where(before < 0, self._last.get(kind, 0), times[before])
             seen = (before >= 0) | (kind in self._last)
             near |= seen & (np.abs(times - known) <= self._far_ns)
+            back |= seen & which & given.joints & (times < known - self._far_ns)
         for kind, time_ns, _ in self._held:
             near &= given.joints != (kind == JOINTS)
             near &= np.abs(times - time_ns) > self._far_ns
-        count = int(np.argmin(np.append(near, False)))
+        count = int(np.argmin(np.append(near & ~back, False)))
         for kind in (JOINTS, POSES):
             where = given.where(kind)
             passed = int(np.searchsorted(where, count))
@@ -84,7 +86,7 @@ class Gate:
     def _admitted(self, given: Slice) -> tuple[list[Slice], bool]:
         """Take one message; return what passes, and whether the joints' clock was moved back."""
         kind, time_ns = JOINTS if given.joints[0] else POSES, int(given.times[0])
-        if self._is_near(time_ns):
+        if self._is_near(kind, time_ns):
             self._last[kind] = time_ns
             found = [*self._now_near(), given]
             self._last[kind] = time_ns
@@ -106,14 +108,19 @@ class Gate:
         self._last.update((other, time) for other, time, _ in freed)
         return [item for *_, item in freed], self._last.get(JOINTS, 0) < before
 
-    def _is_near(self, time_ns: int) -> bool:
-        lasts = self._last.values()
+    def _is_near(self, kind: str, time_ns: int) -> bool:
+        lasts, last = self._last.values(), self._last.get(JOINTS, 0)
+        held = next((time for other, time, _ in reversed(self._held) if other == JOINTS), last)
+        if kind == JOINTS and time_ns < (last if held < last else last - self._far_ns):
+            return False  # their clock was moved back perhaps: these do not return
+        if held < last and 2 * time_ns < held + last:  # and this belongs to them
+            return False
         return not lasts or any(abs(time_ns - last) <= self._far_ns for last in lasts)
 
     def _now_near(self) -> list[Slice]:
         found = []
         for each in tuple(self._held):
-            if self._is_near(each[1]):
+            if self._is_near(*each[:2]):
                 self._last[each[0]] = each[1]
                 self._held.remove(each)
                 found.append(each[2])

@@ -197,11 +197,17 @@ def test_a_recording_played_again_counts_one_jump_however_it_comes(seed):
         assert session.account().notes.get('the clock jumped back', 0) == again
 
 
-@pytest.mark.parametrize(('mode', 'jump'), [('continuous', 2.5), ('dwell', 6.5), ('dwell', 6.95)])
-def test_joints_of_before_a_jump_back_do_not_mix_with_those_after_it(mode, jump):
+@pytest.mark.parametrize(
+    ('mode', 'jump', 'off'),
+    [
+        *(('continuous', 2.5, -1.6), ('dwell', 6.5, -1.6), ('dwell', 6.95, -1.6)),
+        *(('dwell', jump, -1.2) for jump in (6.2, 6.5, 6.8)),
+    ],
+)
+def test_joints_of_before_a_jump_back_do_not_mix_with_those_after_it(mode, jump, off):
     """While the delay was estimated, or if the jump was short, both were on one track."""
     motion = sweep(6, np.random.default_rng(3)) if mode == 'continuous' else MOTION
-    session, off, end = CalibrationSession(ARM, Settings(mode=mode)), -1.6, 24.0
+    session, end = CalibrationSession(ARM, Settings(mode=mode)), 24.0
     times, seen = np.arange(0.0, end, 0.02), np.arange(0.003, end, 0.05)
     clocks = [t + np.where(t < jump, 0.0, off) for t in (times, seen)]
     poses = ARM.forward(motion(seen))
