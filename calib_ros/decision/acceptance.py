@@ -137,8 +137,8 @@ def _of_the_gain(
     if after.rms_mm > largest and (before.rms_mm > largest or gain > limit):
         yield Reason(
             Rule.LARGEST_ERROR,
-            f'RMS {after.rms_mm:.1f} mm remains on held-out poses, more than '
-            f'{largest:g} mm (largest_error)',
+            f'RMS {after.rms_mm:.{1 if largest >= 1.0 else 3}f} mm remains on held-out poses, '
+            f'more than {largest:g} mm (largest_error)',
         )
     if not gain > limit:
         text = f'RMS {before.rms_mm:.3f} mm before, {after.rms_mm:.3f} mm after'

@@ -80,11 +80,12 @@ def rules_of(before, after, judged):
     return {each.rule for each in refused(before, after, judged)}
 
 
-def refused(before, after, judged, **change):
+def refused(before, after, judged, largest_error=0.01, **change):
     """Return the refusals by position errors (N, 3) [m] on pairs that were left out."""
     numbers, none = np.arange(len(judged)), np.full((len(judged), 3), np.nan)
     parts = [Residuals(x, none, numbers, none[:, :2]) for x in (before, after)]
-    problem = SimpleNamespace(largest_error=0.01, largest_length=1.0, largest_angle=1.0, sets=())
+    problem = SimpleNamespace(largest_length=1.0, largest_angle=1.0, sets=())
+    problem.largest_error = largest_error
     given = {'converged': True, 'parameters': ()} | change
     result = SimpleNamespace(
         step=None,
@@ -95,6 +96,14 @@ def refused(before, after, judged, **change):
         **given,
     )
     return [*refusals(problem, result, None, False, True)]
+
+
+@pytest.mark.parametrize(('left', 'limit', 'said'), [(2e-5, 1e-5, '0.020'), (0.02, 0.01, '20.0')])
+def test_what_remains_is_told_as_precisely_as_its_limit(left, limit, said):
+    """It said: RMS 0.0 mm remains, more than 0.01 mm."""
+    away = np.full((40, 3), left / np.sqrt(3.0))
+    told = refused(2.0 * away, away, np.ones(40, dtype=bool), limit)
+    assert any(f'RMS {said} mm remains on held-out poses, more than' in each for each in told)
 
 
 @pytest.mark.parametrize(
