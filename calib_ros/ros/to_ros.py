@@ -42,13 +42,13 @@ def in_hand(owners: Mapping[str, Owner]) -> bool:
 def dh_parameters(chain: Chain) -> Float64MultiArray:
     """Return the DH table, joint by joint."""
     rows, columns = chain.table.shape
-    array = Float64MultiArray()
-    array.layout.dim = [
+    message = Float64MultiArray()
+    message.layout.dim = [
         MultiArrayDimension(label='joint', size=rows, stride=rows * columns),
         MultiArrayDimension(label=','.join(chain.columns), size=columns, stride=columns),
     ]
-    array.data = chain.table.ravel().tolist()
-    return array
+    message.data = chain.table.ravel().tolist()
+    return message
 
 
 def pose(chain: Chain, joints: Sequence[float], stamp_ns: int, frame_id: str) -> PoseStamped:
