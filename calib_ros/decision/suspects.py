@@ -77,6 +77,8 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
         remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
         what = 'the axes of the measuring device are left-handed'
         yield Suspect(what, remedy, (mirrored,), 3, part='handed')
+        if not seen.oriented.any():
+            yield from _of_points(chain)
     yield from _of_places(chain)
 
 
@@ -167,6 +169,30 @@ def _of_coordinates(seen: Observations) -> Iterator[Suspect]:
         own = partial(scaled, axis=k)
         for each in _of_lengths(f'{name} coordinates alone', name, own):
             yield replace(each, changes=(*back, *each.changes, *back))
+
+
+def _of_points(chain: Chain) -> Iterator[Suspect]:
+    """Yield that positions are of a fixed point in a camera on the flange.
+
+    They fit the arm from flange to base, in the other convention.
+    """
+    if chain.held or any(joint.b or joint.beta for joint in chain.joints):
+        return
+    kinds = ('a', 'd', 'alpha', 'theta', 'sign')
+    joints = [replace(j, **{k: -getattr(j, k) for k in kinds}) for j in reversed(chain.joints)]
+    arm = replace(chain, joints=tuple(joints), convention=_other(chain), parallel=None)
+    remedy = 'measure poses there (of a board or marker), and give --eye-in-hand'
+    yield Suspect(
+        'the positions are of a fixed point, seen by a camera on the flange',
+        remedy,
+        (joints_by(np.eye(len(joints))[::-1]),),
+        chain=replace(arm, base=None, tool=None, frames=()),
+        published='publish poses of a board or marker, and set eye_in_hand=true in sources',
+    )
+
+
+def _other(chain: Chain) -> Convention:
+    return 'modified' if chain.convention == 'standard' else 'standard'
 
 
 def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
@@ -349,7 +375,7 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
         small = [replace(j, a=mm * j.a, b=mm * j.b, d=mm * j.d) for j in chain.joints]
         what, remedy = 'the lengths of the chain file are in mm, not metres', 'give metres there'
         yield Suspect(what, remedy, chain=replace(chain, joints=tuple(small)), published=remedy)
-    other: Convention = 'modified' if chain.convention == 'standard' else 'standard'
+    other = _other(chain)
     what = f'the DH table is in the {other} convention, not the {chain.convention} one'
     remedy = f'convention: {other} in the chain file'
     arm = replace(chain, convention=other, parallel=None)
