@@ -10,7 +10,6 @@ from fits import NOISE, SCARA, SIGMAS, arm, rms
 
 from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision.delays import uneven
 from calib_ros.decision.misfits import explained_share
 from calib_ros.decision.plausibility import _motion
 from calib_ros.decision.reasons import Rule
@@ -340,18 +339,6 @@ def test_uneven_delays_in_motion_are_named_and_refused_where_they_harm(kind, ref
     assert (Rule.LAG in [each.rule for each in result.refusals]) == refused
     assert len(told) == (kind in words)
     assert all(words[kind] in each for each in told)
-
-
-def test_a_late_joint_is_brought_back_to_where_it_was():
-    rng = np.random.default_rng(1)
-    joints, speed = UR.random_joints(100, rng), 0.3 * rng.normal(size=(100, 6))
-    then = joints - 4e-3 * np.eye(6)[1] * speed
-    seen = replace(measure(arm(0), then, rng, *NOISE), joints=joints, velocity=speed)
-    problem = Problem(UR, seen, **SIGMAS)
-    _, there = uneven(problem, identify(problem))
-    moved = np.median((there.observations.joints - joints) / speed, axis=0)
-    late = moved - moved[2]  # they share that of the device
-    np.testing.assert_allclose(late[:5], [0.0, -4e-3, 0.0, 0.0, 0.0], rtol=0, atol=4e-4)
 
 
 @pytest.mark.parametrize(('ppm', 'told'), [(0.0, False), (300.0, True)])

@@ -1,0 +1,48 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import NOISE, SIGMAS, UR10E, arm
+
+from calib_ros import Problem, identify
+from calib_ros.apply.simulation import measure
+from calib_ros.decision.delays import uneven
+
+
+def moving(count, delays=0.0, noise=NOISE):
+    """Return poses in motion, joints late by some delays (count, 6) [s], by a clock."""
+    rng = np.random.default_rng(1)
+    joints, speed = UR10E.random_joints(count, rng), 0.3 * rng.normal(size=(count, 6))
+    seen = measure(arm(0), joints - delays * speed, rng, *noise)
+    stamps = 1_700_000_000_000_000_000 + 100_000_000 * np.arange(count)
+    return replace(seen, joints=joints, velocity=speed, stamps_ns=stamps)
+
+
+def test_a_late_joint_is_brought_back_to_where_it_was():
+    seen = moving(100, 4e-3 * np.eye(6)[1])
+    problem = Problem(UR10E, seen, **SIGMAS)
+    text, there = uneven(problem, identify(problem))
+    moved = np.median((there.observations.joints - seen.joints) / seen.velocity, axis=0)
+    late = moved - moved[2]  # they share that of the device
+    np.testing.assert_allclose(late[:5], [0.0, -4e-3, 0.0, 0.0, 0.0], rtol=0, atol=4e-4)
+    assert 'joints late by different times explain 9' in text
+
+
+def test_a_delay_that_changes_is_undone_where_the_arm_moved():
+    delays = 4e-3 * np.cos(np.linspace(0.0, 2.0 * np.pi, 100))[:, np.newaxis]
+    seen, at_rest = moving(100, delays), replace(moving(20), velocity=None)
+    problem = Problem(UR10E, seen, more=(at_rest,), **SIGMAS)
+    text, there = uneven(problem, identify(problem))
+    assert 'a delay that changes explains 9' in text
+    moved = np.median((there.observations.joints - seen.joints) / seen.velocity, axis=1)
+    np.testing.assert_allclose(moved, -delays[:, 0], rtol=0, atol=4e-4)
+    (rest,) = there.more
+    np.testing.assert_array_equal(rest.joints, at_rest.joints)
+
+
+@pytest.mark.parametrize('count', [100, 8])
+def test_noise_is_no_delay_and_few_poses_tell_none(count):
+    problem = Problem(UR10E, moving(count, noise=3.0 * np.array(NOISE)), **SIGMAS)
+    assert uneven(problem, identify(problem)) is None
