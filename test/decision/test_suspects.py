@@ -312,7 +312,7 @@ def test_a_wrong_sign_in_the_dh_table_is_named(kind, which, accepted, rng):
     rows = [replace(j, **{kind: -getattr(j, kind)}) if j.name in which else j for j in arm.joints]
     wrong = replace(arm, joints=tuple(rows), parallel=None)
     true = faulty(arm, Cell(), rng)
-    seen = measure(true, arm.random_joints(40, rng), rng, 5e-5, 2e-4)
+    seen = measure(true, arm.random_joints(24, rng), rng, 5e-5, 2e-4)
     found = identify(Problem(wrong, seen))
     assert found.accepted == accepted
     said = found.remarks if accepted else found.refusals
