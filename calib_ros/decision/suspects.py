@@ -41,8 +41,8 @@ MIXED_UP_UNITS = (
     ('radians', 'degrees', 'rad', np.degrees(1.0)),
 )
 """Actual unit of angles, assumed unit, option, and size of the actual in the assumed one."""
-SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254, 'ft': 0.3048}
-NAMES = {'in': 'inches', 'ft': 'feet'}  # of units too short to be read as such
+UNITS = (('mm', 'mm', 1e-3), ('cm', 'cm', 1e-2), ('in', 'inches', 0.0254), ('ft', 'feet', 0.3048))
+"""Units of lengths, in words, and their sizes [m]."""
 FIRST = ('measured', 'handed', 'order')
 """Parts whose mistakes are undone before those of single joints."""
 NOT_ON_FLANGE = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
@@ -125,8 +125,7 @@ def _units(chain: Chain) -> Iterator[Suspect]:
     """Yield units of lengths, and of angles at the same time."""
     whole = 'positions and linear joints' if _linear(chain) else 'positions'
     degrees = of_kind(chain, 'revolute', np.radians(1.0))
-    for unit, size in SCALES.items():
-        name = NAMES.get(unit, unit)
+    for unit, name, size in UNITS:
         for way, option, factor in (
             (f'in {name}, not metres', f'--length {unit}', size),
             (f'in metres, not {name}', '--length m', 1.0 / size),
@@ -145,8 +144,7 @@ def _linear(chain: Chain) -> list[str]:
 
 def _of_lengths(key: str, columns: Sequence[str], change: Rescaled) -> Iterator[Suspect]:
     """Yield units of some lengths alone."""
-    for unit, size in SCALES.items() if columns else ():
-        name = NAMES.get(unit, unit)
+    for _, name, size in UNITS if columns else ():
         for way, factor in ((f'{name}, not metres', size), (f'metres, not {name}', 1.0 / size)):
             option = '--columns ' + ','.join(f'{each}={each}*{factor:g}' for each in columns)
             yield Suspect(f'the {key} are in {way}', option, (change(factor),), 2, part='measured')
@@ -225,7 +223,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
         what = 'the poses are of the world in the target, as from a camera on the flange'
         remedy = '--eye-in-hand (or --inverse, where the device stands)'
         ways.append(Suspect(what, remedy, (Observations.inverted,), published=_in_sources(True)))
-    in_mm, degrees = lengths(chain, SCALES['mm']), of_kind(chain, 'revolute', np.radians(1.0))
+    in_mm, degrees = lengths(chain, 1e-3), of_kind(chain, 'revolute', np.radians(1.0))
     for way in ways:
         yield replace(way, changes=(*back, *way.changes))
         for units, option, others in (
@@ -371,8 +369,7 @@ def _of_signs(chain: Chain) -> Iterator[Suspect]:
 def _of_arms(chain: Chain) -> Iterator[Suspect]:
     """Yield lengths in mm, the other convention, wrong frames, and arms with like joints."""
     if too_long(chain):  # a shorter one is of metres: any place fits a tiny arm to its size
-        mm = SCALES['mm']
-        small = [replace(j, a=mm * j.a, b=mm * j.b, d=mm * j.d) for j in chain.joints]
+        small = [replace(j, a=1e-3 * j.a, b=1e-3 * j.b, d=1e-3 * j.d) for j in chain.joints]
         what, remedy = 'the lengths of the chain file are in mm, not metres', 'give metres there'
         yield Suspect(what, remedy, chain=replace(chain, joints=tuple(small)), published=remedy)
     other = _other(chain)

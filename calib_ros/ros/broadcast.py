@@ -52,10 +52,15 @@ class Broadcast:
         stands, moves = (target, world) if in_hand else (world, target)
         if not world:
             self._node.get_logger().warning('the measurements name no frame: /tf_static lacks it')
-        if given.base_frame and stands:
+        for name in {given.base_frame, given.flange_frame} & {stands, moves} - {''}:
+            self._node.get_logger().warning(
+                f'"{name}" is the frame of what is measured, too: /tf_static lacks it; name '
+                'base_frame, flange_frame and target_frame otherwise'
+            )
+        if given.base_frame and stands not in ('', given.base_frame):
             base = chain.frame('base').matrix @ se3.invert(self._base)
             transforms.append(self._transform(stands, given.base_frame, base))
-        if given.flange_frame and moves:
+        if given.flange_frame and moves not in ('', given.flange_frame):
             tool = se3.invert(self._tool) @ chain.frame('tool').matrix
             transforms.append(self._transform(given.flange_frame, moves, tool))
         self._publisher.publish(self._type(transforms=transforms))

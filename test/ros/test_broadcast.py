@@ -92,8 +92,11 @@ def test_a_camera_on_the_flange_sees_a_target_that_stands():
     assert set(found) == {('ball', 'base_link'), ('tool0', 'camera')}
 
 
-def test_frames_without_a_name_are_left_out():
+def test_frames_without_a_name_of_their_own_are_left_out():
+    """A frame that is its own parent would be an error in every listener."""
     chain = true_arm()
+    assert set(broadcast(chain, world='base_link')) == {('tool0', 'ball')}
+    assert set(broadcast(chain, 'tool0', in_hand=True)) == {('ball', 'base_link')}
     assert set(broadcast(chain, base_frame='')) == {('tool0', 'ball')}
     assert set(broadcast(chain, flange_frame='')) == {('leica', 'base_link')}
     assert set(broadcast(chain, world='')) == {('tool0', 'ball')}
