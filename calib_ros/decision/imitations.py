@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Does the arm imitate a frame that moved? By the evidence for errors of an arm (`sizes.py`).
+"""Does the arm imitate a move of a frame or zero? By the evidence for its errors (`sizes.py`).
 
 If the poses before a move and those after it lie apart, the arm's parameters explain it and leave
 no residual, but with offsets much larger than those of this arm without the move.

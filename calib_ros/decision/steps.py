@@ -218,13 +218,15 @@ class _Scan:
         return found
 
     def imitated(self, fitted: Fitted) -> _Found | None:
-        """Return the move of a frame that the arm imitates, if any."""
+        """Return the move of a frame, or of a zero, that the arm imitates, if any."""
         some, every = self._coarse
         if not len(some) or all(map(self._chain.owns_frame, fitted.names)):
             return None
         arm = Imitation(fitted, self._names[: self._fitted], self._products)
         highest, found = LEAST, None
-        groups = [each for each in self._groups if each.kind in FRAMES and not each.held]
+        known = {*fitted.problem.given} | {*self._added} - {*fitted.problem.free}
+        groups = [g for g in self._groups if g.kind in FRAMES or known.isdisjoint(g.names)]
+        groups = [each for each in groups if not each.held]
         trials = np.log(self._stops * len(self._groups))
         for group in groups:
             gains = arm.gains(*self._moving(group, every))
@@ -251,7 +253,7 @@ class _Scan:
         return (int(gross[0]), int(gross[-1]) + 1) if alone else ()
 
     def _moving(self, group: _Group, products: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return products (B, K, P + 1) of a frame's moves with the fit, and (B, K, K)."""
+        """Return products (B, K, P + 1) of a group's moves with the fit, and (B, K, K)."""
         own = products[:, [self._added.index(name) for name in group.names]]
         columns = [self._names.index(name) for name in group.names]
         return own[:, :, [*range(self._fitted), -1]], own[:, :, columns]

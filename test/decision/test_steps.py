@@ -133,6 +133,21 @@ def test_a_move_that_the_arm_imitates_is_named(seed, at):
     assert result.step.size == pytest.approx(1e-3, rel=0.1)
 
 
+@pytest.mark.parametrize('seed', [6, 11])
+def test_a_slip_that_the_arm_imitates_is_named(seed):
+    """Between stations with only the wrist moving; positions alone, or poses."""
+    rng = np.random.default_rng(seed)
+    true = arm(rng, 0.3)
+    q = np.repeat(UR10E.random_joints(5, rng), 8, axis=0)
+    q[:, 3:] += rng.uniform(-0.3, 0.3, (40, 3))
+    seen = measure(true, q, rng, *NOISE, oriented=bool(seed % 2))
+    assert identify(Problem(UR10E, seen, **SIGMAS)).accepted
+    result = identify(Problem(UR10E, moved(seen, true, 'joint', 7e-4, at=16), **SIGMAS))
+    assert (result.step.what, result.step.sample) == (UR10E.joint_names[2], 16)
+    assert result.step.size == pytest.approx(7e-4, rel=0.3)
+    assert not result.accepted
+
+
 def test_a_bumped_target_is_no_gain_of_a_healthy_arm():
     """Along sweeps a bump of 0.3 mm passes for an error of the arm on poses left out."""
     named = 0
