@@ -227,7 +227,7 @@ def _tried(
     rough, of_images = [], _of_images(problem)
     likely = suspects(chain, given.sets, of_images)
     for each in (*likely, *in_any_order(chain, given.sets[0], of_images)):
-        if of_rows and not each.changes:
+        if of_rows and (each.chain is not None or not each.changes):
             continue
         few = given.sets
         if each.rows:

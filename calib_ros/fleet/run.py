@@ -219,6 +219,8 @@ def _client(cluster: Cluster) -> Iterator[Any]:
         limited = '' if where else f' (--memory {cluster.memory})'
         try:
             if not where:
+                if dask.utils.parse_bytes(cluster.memory) < 100e6:
+                    raise ValueError('a worker needs 100 MB or more')
                 stack.enter_context(dask.config.set(DASK))
                 local = LocalCluster(
                     n_workers=cluster.workers or None,

@@ -88,14 +88,13 @@ def test_distances_are_lengths_in_standard_deviations(dimensions):
 @pytest.mark.parametrize(('out', 'share'), [(2, 0.3), (5, 0.05), (5, 0.6), (0, 0.3), (1, 0.999)])
 def test_the_chance_of_leaving_so_many_out_is_that_of_the_f_test(out, share, monkeypatch):
     """Chernoff's bound is above the tail of the beta distribution, and not by far."""
-    system = SimpleNamespace(rows=90, count=30, prior=SimpleNamespace(sigmas={'a': 1.0}))
+    system = SimpleNamespace(rows=90, count=30)
     normal = SimpleNamespace(cost=200.0 * share)
-    second = SimpleNamespace(
-        outliers=np.arange(30) < out, fit=SimpleNamespace(normal=normal, chain=None)
-    )
+    second = SimpleNamespace(outliers=np.arange(30) < out, fit=SimpleNamespace(normal=normal))
     least = SimpleNamespace(normal=SimpleNamespace(cost=200.0))
     monkeypatch.setattr(robust, 'minimise', lambda *_, **__: least)
-    found = robust._chance(['a', 'b', 'c', 'd'], system, second, second)
+    names = ['a', 'b', 'c', 'd']
+    found = robust.chance_of_outliers(second, None, names, system, 90 - 3)
     spare, shifts = 0.5 * (90 - 3 - 3 * out), 0.5 * 3 * out
     if not out or share > 0.99:  # all of them, or more than left out by chance
         assert found == (1.0 if out else 0.0)
@@ -106,7 +105,7 @@ def test_the_chance_of_leaving_so_many_out_is_that_of_the_f_test(out, share, mon
     tail = (share / mean) ** spare * ((1.0 - share) / (1.0 - mean)) ** shifts
     assert found == pytest.approx(min(special.comb(30, out) * tail, 1.0), rel=1e-9, abs=0.0)
     second.fit.normal.cost = 0.0  # too small for a float
-    assert 0.0 <= robust._chance(['a', 'b', 'c', 'd'], system, second, second) < 1e-200
+    assert 0.0 <= robust.chance_of_outliers(second, None, names, system, 90 - 3) < 1e-200
 
 
 @pytest.mark.parametrize('loss', ['redescending', 'huber'])
