@@ -65,8 +65,9 @@ JOINT_WORDS = _set(
 NO_JOINT = _set(
     'vel velocity speed qd acc acceleration qdd force torque moment tau effort load currents '
     'voltage power temp temperature std stdev sd sigma err error rms var uncertainty status mode '
-    'count counts strom drehmoment geschwindigkeit courant couple vitesse corriente velocidad '
-    'corrente coppia velocità schleppfehler'
+    'count counts tick ticks min max residual residuals cov covariance strom drehmoment '
+    'geschwindigkeit courant couple vitesse corriente velocidad corrente coppia velocità '
+    'schleppfehler'
 )
 OTHER = NO_JOINT | _set('r s u v a f e n g normal twist angular angle euler rotvec omega gyro')
 """Other quantities that have coordinates, too."""

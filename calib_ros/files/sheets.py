@@ -27,6 +27,7 @@ from calib_ros.files.columns import (
 )
 from calib_ros.files.headers import name_and_unit, only, places
 from calib_ros.files.layouts import Layout
+from calib_ros.files.names import groups
 from calib_ros.files.skipped import refuse_nominal, without_statistics, without_words
 from calib_ros.files.vocabulary import (
     DECIMAL_COMMA,
@@ -113,8 +114,8 @@ def _of_text(path: Path, layout: Layout) -> _Content:
     if layout.comment:
         comment = re.compile(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$')
         comments, text = comment.findall(text), comment.sub('', text)
-    # a header, as numpy and SpatialAnalyzer write it; before a tab it is a name
-    text = re.sub(r'(?m)^(?:[#%]+ +|//[ \t]*)(?=[A-Za-z])', '', text)
+    # a header, as numpy and SpatialAnalyzer write it; # before a tab is a name
+    text = re.sub(r'(?m)^(?!#\t)(?:[#%]+[ \t]+|//[ \t]*)(?=[A-Za-z])', '', text)
     if text.startswith('"') and not re.search(r'(?m)^(?!"[^"\n]*"$)[^\n]', text):  # one cell each
         text = re.sub('(?m)^"|"$', '', text)
         notes.append('whole lines are in quotation marks: read without them')
@@ -184,11 +185,13 @@ def _sheet(
 def _refuse_shifted(columns: Columns, width: int) -> None:
     """Refuse a row with a number more than a header of so many names; a remark there is text.
 
-    Text in all rows is a column: a decimal comma may have made it, or `# q1 q2` have its name.
+    Text in all rows, with integers in the first column, may be a column whose name is before
+    theirs in `# q1 q2`, or follow a decimal comma.
     """
     for name in columns.header[width : width + 1]:
         texts = columns.texts(name)
-        whole = '' not in texts
+        first = columns.texts(columns.header[0])
+        whole = '' not in texts and all(map(str.isdecimal, first))
         for line, cell in zip(columns.lines.tolist(), texts, strict=True):
             if whole or _is_number(cell, ','):
                 raise InputError(
@@ -347,7 +350,8 @@ def _header(
             numbered = [cells[int(n[1:]) - 1] for n in names if int(n[1:]) <= len(cells)]
             of_data = any(_is_number(cell, ',') for cell in numbered)
             return (-1, ()) if of_data else (k, tuple(cells))
-    for column in islice(zip_longest(*(cells for _, cells in rows), fillvalue=''), 9):
+    aside = () if groups(rows[at][1], POSITION, without=frozenset()) else rows
+    for column in islice(zip_longest(*(cells for _, cells in aside), fillvalue=''), 9):
         if {*POSITION} <= {name_and_unit(cell)[0].lower() for cell in column}:
             raise InputError(
                 f'{path} has x, y, z below each other, expected a row for each pose, with all its '

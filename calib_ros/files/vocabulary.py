@@ -32,7 +32,7 @@ UNIT = re.compile(
 UNITS_ARE = re.compile(
     r'\b(?:(?:unit[aeéà]?s?|unidade?s?|\w*einheit(?:en)?)(?: (?:of|di|de) \w+)?'
     rf'(?:\W*[:=\t]\W*(?:in \W?(?=(?:{_ANY})(?!\w)))?'
-    rf'(?!in (?!(?:and|und|et|e|y)\b)[^\W\d])({_ANY})|\W*(?:are )?(?:in )?\W?({_WORDS}))'
+    rf'(?!in (?!(?:and|und|et|e|y)\b)[^\W\d])({_ANY})|\W*(?:are )?(?:in:? )?\W?({_WORDS}))'
     r'|(?:(?:\A|(?<=[^\w ])|(?<=[^\w ] )|all |the |alle |measured )(?:values|werte|angaben)'
     r'|dimensions|coordinates|positions|lengths|angles|längen|winkel)'
     rf'\W*(?:are )?in \W?({_WORDS}))(?!\w)(?:\W+(?:and |und |et |e |y )?({_ANY})(?!\w))?',

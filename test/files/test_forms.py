@@ -42,6 +42,8 @@ FORMS = {
     'a column called #': re.sub(
         '(?m)(?<=.)$', '\tok', '#\t' + PLAIN.replace('\n', '\n1\t', 3)
     ).replace(',', '\t'),
+    'a mark and a tab before the header': '%\t' + PLAIN.replace(',', '\t'),
+    'a remark in every row': re.sub('(?m)(?<=[0-9])$', ',ok', PLAIN),
     'other separators in quotes': 'note,' + PLAIN.replace('\n', '\n"a; b; c; d; e; f, g",', 3),
 }
 
@@ -260,6 +262,14 @@ def test_rows_with_a_number_more_than_the_header_are_refused(tmp_path, rows, lin
         return
     with pytest.raises(InputError, match=f'line {line}: more cells than the 5 columns'):
         read_table(path, 2, foreign=Foreign(Layout()))
+
+
+def test_an_offset_above_the_header_is_no_table_on_its_side(tmp_path):
+    """Whose rows and columns were to be exchanged."""
+    path = tmp_path / 'cell.csv'
+    path.write_text('Tool,,\nx,1\ny,2\nz,3\nAxis 1,Axis 2,X_meas,Y_meas,Z_meas\n1,2,3,4,5\n')
+    with pytest.raises(InputError, match='x=X_meas,y=Y_meas,z=Z_meas'):
+        loading.table(path, ARM, Settings())
 
 
 def test_a_header_that_may_lack_the_name_of_a_column_is_refused(tmp_path):

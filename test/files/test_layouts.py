@@ -166,6 +166,7 @@ def test_a_linear_axis_has_its_own_unit_in_the_header(tmp_path):
         ('Unità di misura: mm\nq1 [gradi],q2,x,y,z', '90,180,1,2,3'),
         ('Unidad: mm\nq1 (grados),q2,x,y,z', '90,180,1,2,3'),
         ('Units: in mm, deg\nq1,q2,x,y,z', '90,180,1,2,3'),
+        ('Units in: mm, deg\nq1,q2,x,y,z', '90,180,1,2,3'),
         ('Alle Angaben in mm\nq1 [deg],q2,x,y,z', '90,180,1,2,3'),
         ('All values are in [mm]\nq1 [deg],q2,x,y,z', '90,180,1,2,3'),
         ('(values in mm)\nq1 [deg],q2,x,y,z', '90,180,1,2,3'),

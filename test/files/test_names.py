@@ -98,7 +98,7 @@ def test_deviations_tell_that_plain_coordinates_may_be_nominal(tmp_path):
     given = [*NAMES, *names('{}_nom'), 'dx', 'dy', 'dz']
     path.write_text(text_of(*measured, names=given))
     assert_same(read_table(path, 2), None)
-    for apart in ('s{}', '{}_std', '{}_vel'):  # other quantities
+    for apart in ('s{}', '{}_std', '{}_vel', '{}min', 'residual{}'):  # others
         path.write_text(text_of(*columns, names=[*NAMES, *(apart.format(a) for a in 'xyz')]))
         assert len(loading.table(path, ARM, Settings()).fitted[0]) == 3
 
