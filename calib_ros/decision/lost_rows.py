@@ -18,6 +18,7 @@ import numpy as np
 from calib_ros.decision.suspects import reordered, rows_away
 from calib_ros.decision.trials import in_frames, misses
 from calib_ros.decision.undoing import Sets, Suspect
+from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.levels import LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
@@ -149,7 +150,8 @@ def repeating(
 def computed_rows(problem: Problem) -> str:
     """Return that the nominal arm gives some rows far better than any device measures others.
 
-    Nominal poses may stand above or below measured ones, or each beside its own.
+    Nominal poses may stand above or below measured ones, or each beside its own. They cover as
+    much as these: base and tool alone explain a pose measured again and again.
     """
     seen = problem.observations
     if seen.pixels is not None or seen.distances is not None or len(seen) < FEWEST_ROWS:
@@ -157,8 +159,10 @@ def computed_rows(problem: Problem) -> str:
     rows, arm = np.arange(len(seen)), replace(problem.chain, base=None, tool=None, frames=())
     third = len(seen) // 3
     alone = seen.changed(base='base', tool='tool')
+    least = NEARER * np.ptp(seen.joints, axis=0)
     for parts in (rows < third, rows >= len(seen) - third), (rows % 2 == 0, rows % 2 == 1):
-        trials = [in_frames(problem, arm, (alone.select(part),)) for part in parts]
+        some = [each for each in map(alone.select, parts) if _covers(each, least)]
+        trials = [in_frames(problem, arm, (each,)) for each in some]
         found = sorted(filter(None, trials), key=lambda one: one.error)
         if len(found) > 1 and found[0].error < EXCEPTION**2 * found[1].error:
             away = misses(found[0].chain, alone, flange(found[0].chain, alone))
@@ -169,6 +173,11 @@ def computed_rows(problem: Problem) -> str:
                 'are these nominal poses, computed and not measured? Leave them out'
             )
     return ''
+
+
+def _covers(seen: Observations, least: FloatArray) -> bool:
+    wide = bool((np.ptp(seen.joints, axis=0) >= least).all())
+    return wide and distinct(seen.configurations) > IN_A_FRAME
 
 
 def _where(before: Flags, after: Flags) -> int:

@@ -226,3 +226,14 @@ def test_nominal_poses_among_measured_ones_are_named(order, oriented):
     where = {'below': 'lines 41 to 80', 'above': 'lines 1 to 40', 'beside': 'lines 2, 4'}[order]
     assert re.match(rf'{where}.* fit the uncorrected arm to .*: are these nominal', str(first))
     assert identify(Problem(UR10E, seen.select(~nominal))).accepted
+
+
+@pytest.mark.parametrize(('count', 'width'), [(1, 0.0), (1, 0.01), (3, 0.0)])
+@pytest.mark.parametrize('again', [slice(None, None, 2), slice(0, 20)])
+def test_poses_measured_again_and_again_are_not_nominal(again, count, width):
+    """Base and tool alone explain them, however wrong the arm is."""
+    rng = np.random.default_rng(0)
+    true, q = arm(rng), UR10E.random_joints(60, rng)
+    q[again] = q[np.arange(len(q[again])) % count] + rng.uniform(-width, width, q[again].shape)
+    seen = measure(true, q, rng, 2e-6, oriented=False)
+    assert not lost_rows.computed_rows(Problem(UR10E, seen, sigma_position=1e-6))
