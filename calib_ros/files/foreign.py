@@ -257,8 +257,11 @@ class _Table:
 
     def unread(self) -> list[str]:
         """Return the names of the columns that nothing is made of."""
-        used = {name for each in self._columns.values() for name in each.names}
-        return [name for k, name in enumerate(self._sheet.header, 1) if f'#{k}' not in used]
+        return [name for k, name in enumerate(self._sheet.header, 1) if f'#{k}' not in self._used]
+
+    @property
+    def _used(self) -> set[str]:
+        return {name for each in self._columns.values() for name in each.names}
 
     def labels(self, other: _Table) -> Iterator[tuple[str, str, list[str]]]:
         """Yield columns that may name the poses of both tables: a kind, the name, and the cells.
@@ -277,8 +280,13 @@ class _Table:
                 yield name.lower() if number else '', name, bare
 
     def numbered(self) -> Iterator[tuple[str, list[str]]]:
-        """Yield columns of names with a number, or of numbers that count, and these numbers."""
+        """Yield columns of names with a number, or of numbers that count, and these numbers.
+
+        Numbers that are read count nothing.
+        """
         for k, name in enumerate(self._sheet.header, start=1):
+            if f'#{k}' in self._used:
+                continue
             cells = self._sheet.columns.texts(f'#{k}')
             found = takewhile(bool, map(NUMBERED.fullmatch, cells))
             numbers = [each[1] for each in found if each]
