@@ -104,7 +104,8 @@ def _with_explained(found: Robust, names: Sequence[str], system: System) -> Robu
     """Return a fit with the samples left out, if that explains most of them at a small price.
 
     What the model lacks looks like gross errors at the only poses in a part of the joint range, if
-    the others decide alone. Gross errors keep their residuals in any fit, or spoil the others'.
+    the others decide alone. Gross errors keep their residuals in any fit, or spoil the others':
+    an arm that bends made these up to three times as large.
     """
     out = found.outliers
     if out.sum() < LEAST_ASIDE:
@@ -115,7 +116,7 @@ def _with_explained(found: Robust, names: Sequence[str], system: System) -> Robu
     share = max(1.0 - unknown(names, system) / system.rows, ROUNDING)
     price = np.sqrt(after[~out].sum() / max(before[~out].sum(), ROUNDING)) / share
     left = price * np.sqrt(after / np.maximum(before, ROUNDING))
-    if np.median(left[out]) > NEARER:
+    if price > 1.0 / NEARER or np.median(left[out]) > NEARER:
         return found
     nearer = np.where(out & (left < NEARER), INNER, np.inf)
     return reweighted(

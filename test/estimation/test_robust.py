@@ -211,6 +211,27 @@ def test_what_a_simpler_model_explains_is_no_gross_error_for_a_richer_one():
     assert again.fitted.figures[1].rms_mm == pytest.approx(result.fitted.figures[1].rms_mm)
 
 
+def in_branches(rng, *counts):
+    """Return joint values: so many with the elbow one way, and so many the other way."""
+    widths = np.repeat(
+        np.radians([[21, 18, 17, 180, 110, 180], [10, 6, 18, 180, 120, 180]]), counts, 0
+    )
+    middles = np.repeat(np.radians([[3, -5, 30, 0, 0, 0], [175, -86, -12, 0, 0, 0]]), counts, 0)
+    return middles + widths * rng.uniform(-1.0, 1.0, middles.shape)
+
+
+@pytest.mark.parametrize('seed', [0, 2, 4])
+def test_a_target_knocked_before_the_only_poses_of_a_branch_spoils_no_others(seed):
+    """Few poses can be explained, at the price of errors five times as large at the others."""
+    nominal, rng = load_chain('abb_irb120'), np.random.default_rng([seed, 40, 3, 20])
+    true = faulty(nominal, Cell(), rng)
+    joints = np.concatenate([in_branches(rng, 40, 0), in_branches(rng, 0, 3)])
+    seen = measure(true, joints, rng, 2e-5, oriented=False)
+    seen.positions[40:] += 2e-3 * directions(1, rng)
+    found = fitted(Problem(nominal, seen, sigma_position=2e-5))
+    assert rms(found.chain, true, joints[:40]) < 4e-5
+
+
 @pytest.mark.parametrize('seed', SEEDS)
 def test_the_only_poses_of_a_branch_are_no_gross_errors(unsearched, seed):
     """An arm that bends: the other poses alone are fitted better, at the cost of these."""
@@ -218,13 +239,7 @@ def test_the_only_poses_of_a_branch_are_no_gross_errors(unsearched, seed):
     bends = {name: 10.0 * expected(name) for name in members(nominal, 'gravity')}
     true = faulty(nominal, Cell(), rng)
     true = true.with_effect_values({n: float(rng.normal()) * bend for n, bend in bends.items()})
-    middle, width = np.radians([[3, -5, 30, 0, 0, 0], [21, 18, 17, 180, 110, 180]])
-    other, there = np.radians([[175, -86, -12, 0, 0, 0], [10, 6, 18, 180, 120, 180]])
-    joints, unseen = (
-        rng.uniform(-1.0, 1.0, (count, 6)) * np.repeat([width, there], each, axis=0)
-        + np.repeat([middle, other], each, axis=0)
-        for count, each in ((127, (114, 13)), (300, (0, 300)))
-    )
+    joints, unseen = (in_branches(rng, *counts) for counts in ((114, 13), (0, 300)))
     joints = rng.permutation(joints)
     result = identify(Problem(nominal, measure(true, joints, rng, 5e-6, 2e-5)))
     before, after = (rms(chain, true, unseen) for chain in (result.before, result.chain))
