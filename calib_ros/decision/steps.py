@@ -56,6 +56,9 @@ def find_step(fitted: Fitted, held: bool = False) -> Step | None:
     if found is not None:
         return None if scan.drifts(found) else scan.described(found)
     found = plain.imitated(fitted)
+    if found is not None and found.group.kind == 'joint' and fitted.robust.outliers.any():
+        plain = _Scan(fitted, loaded=False, gross=False)  # a slip leaves no gross errors
+        found = plain.imitated(fitted)
     step = None if found is None else plain.described(found)
     return step if step is not None and step.harmful else None  # else nothing was imitated
 
