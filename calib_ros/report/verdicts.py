@@ -94,7 +94,7 @@ def standing(found: Verification) -> tuple[Headline, tuple[str, ...]]:
     if found.reused and found.verdict == 'no verdict':
         return REUSED
     state, steps = STANDINGS[found.verdict]
-    if found.verdict == 'UNDECIDED' and found.needed is None:
+    if found.verdict == 'UNDECIDED' and found.needed is None and not found.outside:
         state, steps = AT_THE_LIMIT
     if not found.by_program:  # nor whether the correction reaches the arm
         state = replace(state, heading=state.heading.replace('the arm', 'the calibration'))

@@ -167,7 +167,10 @@ def test_poses_outside_the_region_do_not_lead_to_more_of_them():
     assert SPREAD_OUT in standing(found)[1][0]
     assert 'about 50 poses' in in_words(found)
     partly = replace(found, outside=0.004)
-    assert 'within the region' in standing(partly)[1][0]
+    for each in (partly, replace(partly, needed=None)):
+        state, steps = standing(each)
+        assert 'within the region' in steps[0]
+        assert 'as large as the limit' not in state.heading
     assert 'less than 1 % of the measurements are outside' in in_words(partly)
     assert 'about 50 poses' not in in_words(partly)
     page = verification_page(arm, [seen], partly)
