@@ -16,7 +16,7 @@ from itertools import permutations, product
 import numpy as np
 
 from calib_ros.decision.suspects import reordered, rows_away
-from calib_ros.decision.trials import in_frames, misses
+from calib_ros.decision.trials import in_frames, largest_of, misses
 from calib_ros.decision.undoing import Sets, Suspect
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.levels import LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
@@ -151,7 +151,8 @@ def computed_rows(problem: Problem) -> str:
     """Return that the nominal arm gives some rows far better than any device measures others.
 
     Nominal poses may stand above or below measured ones, or each beside its own. They cover as
-    much as these: base and tool alone explain a pose measured again and again.
+    much as these: base and tool alone explain a pose measured again and again. Rows that no arm
+    explains are no measured poses of this one.
     """
     seen = problem.observations
     if seen.pixels is not None or seen.distances is not None or len(seen) < FEWEST_ROWS:
@@ -164,7 +165,9 @@ def computed_rows(problem: Problem) -> str:
         some = [each for each in map(alone.select, parts) if _covers(each, least)]
         trials = [in_frames(problem, arm, (each,)) for each in some]
         found = sorted(filter(None, trials), key=lambda one: one.error)
-        if len(found) > 1 and found[0].error < EXCEPTION**2 * found[1].error:
+        if len(found) < 2 or found[1].error > largest_of(problem):
+            continue
+        if found[0].error < EXCEPTION**2 * found[1].error:
             away = misses(found[0].chain, alone, flange(found[0].chain, alone))
             near = np.flatnonzero(away < EXCEPTION * found[1].error).tolist()
             return (

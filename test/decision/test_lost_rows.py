@@ -228,6 +228,14 @@ def test_nominal_poses_among_measured_ones_are_named(order, oriented):
     assert identify(Problem(UR10E, seen.select(~nominal))).accepted
 
 
+def test_rows_beside_others_that_no_arm_explains_are_not_nominal():
+    """Their joint values are of other moments, say; the arm's errors are not seen beside these."""
+    rng = np.random.default_rng(3)
+    seen = measure(arm(rng), UR10E.random_joints(60, rng), rng, *NOISE)
+    seen.positions[20:] += rng.normal(scale=0.5, size=(40, 3))
+    assert not lost_rows.computed_rows(Problem(UR10E, seen))
+
+
 @pytest.mark.parametrize(('count', 'width'), [(1, 0.0), (1, 0.01), (3, 0.0)])
 @pytest.mark.parametrize('again', [slice(None, None, 2), slice(0, 20)])
 def test_poses_measured_again_and_again_are_not_nominal(again, count, width):
