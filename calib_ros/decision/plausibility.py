@@ -38,6 +38,7 @@ from calib_ros.estimation.levels import (
 )
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.robust import SUSPICIOUS
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics import effects
@@ -120,7 +121,8 @@ def _sessions(problem: Problem, result: Identification) -> str:
     if result.noise.consistent:
         return ''
     if len(problem.sets) == 1:
-        return computed_rows(problem)
+        many = len(result.outliers) > EXCEPTION * len(problem.observations)
+        return computed_rows(problem) if many or result.noise.position > SUSPICIOUS else ''
     sessions: list[list[Observations]] = []
     for each in problem.sets:
         mine = [s for s in sessions if any(each.base == o.base or each.tool == o.tool for o in s)]
