@@ -151,8 +151,8 @@ def computed_rows(problem: Problem) -> str:
     """Return that the nominal arm gives some rows far better than any device measures others.
 
     Nominal poses may stand above or below measured ones, or each beside its own. They cover as
-    much as these: base and tool alone explain a pose measured again and again. Rows that no arm
-    explains are no measured poses of this one.
+    much as these: base and tool alone explain a pose measured again and again. If no arm explains
+    the others, they are wrong themselves, and these may be measured.
     """
     seen = problem.observations
     if seen.pixels is not None or seen.distances is not None or len(seen) < FEWEST_ROWS:
