@@ -33,7 +33,7 @@ from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.decision import mistakes
-from calib_ros.decision.comparison import Comparison, along_base, compare
+from calib_ros.decision.comparison import Comparison, along_base, axes_of, by_axes, compare
 from calib_ros.decision.moved import Step
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.estimation.configurations import configurations
@@ -41,6 +41,7 @@ from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER
+from calib_ros.estimation.samples import residual_arrays
 from calib_ros.estimation.start import in_new_frames, released
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
@@ -362,10 +363,9 @@ def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str
 def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
     for base in dict.fromkeys(each.base for each in sets):
         own = [each for each in sets if each.base == base]
-        found = np.concatenate(
-            [chain.forward(e.joints, e.approach, e.base, e.tool)[:, :3, 3] for e in own]
-        )
         wanted = np.concatenate([each.positions for each in own])
+        left = [by_axes(residual_arrays(chain, each)[0], axes_of(chain, each)) for each in own]
+        found = wanted - np.concatenate(left) @ chain.frame(base).matrix[:3, :3].T
         middle, goal = found.mean(axis=0), wanted.mean(axis=0)
         turn = se3.nearest_rotation((wanted - goal).T @ (found - middle))
         motion = se3.transform(turn, goal - turn @ middle)

@@ -142,7 +142,7 @@ or .db3
   --csv FILE  a table, whatever its file name
   --chain! ROBOT  {CHAIN}
   --session NAME  only rows with this name in the column session; several joined by commas
-  --eye-in-hand  poses are of a fixed target, seen by a camera on the flange
+  --eye-in-hand  poses or positions are of a fixed target, seen from the flange
   --largest-loss SHARE={EXCEPTION}  share of a bag's messages that may be lost or unused for \
 the result to be accepted; 1: any
   --sigma-touch M  standard deviation of heights over touched planes; default: 1e-4

@@ -59,12 +59,12 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     if (
         (len(table.fitted), len(table.held_out) > 1) != (1, False)
         or len({(x.base, x.tool, x.inverse) for x in every}) > 1
-        or any(x.socket or x.distances is not None or x.pixels is not None for x in every)
+        or any(x.socket or x.distances is not None or x.points is not None for x in every)
         or not all((x.oriented == oriented).all() for x in every)
     ):
         raise InputError(
-            'a bag can hold only poses or positions of one session, device and target, all with '
-            'an orientation or none, and some of them to fit'
+            'a bag can hold only poses or positions of one session, fixed device and target, all '
+            'with an orientation or none, and some of them to fit'
         )
     lost = {
         'covariance': 'covariances',

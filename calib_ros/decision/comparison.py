@@ -164,12 +164,25 @@ def compare(
 
 def along_base(found: Residuals, chain: Chain, sets: Sequence[Observations]) -> Residuals:
     """Return residuals of sets along the axes of the arm's base, which all devices share."""
-    turns = [np.tile(chain.frame(each.base).matrix[:3, :3], (len(each), 1, 1)) for each in sets]
-    position, orientation = (
-        np.einsum('nc,ncd->nd', part, np.concatenate(turns))
-        for part in (found.position, found.orientation)
-    )
+    turns = np.concatenate([axes_of(chain, each) for each in sets])
+    position, orientation = by_axes(found.position, turns), by_axes(found.orientation, turns)
     return replace(found, position=position, orientation=orientation)
+
+
+def by_axes(vectors: FloatArray, axes: FloatArray) -> FloatArray:
+    """Return vectors (N, 3) along other axes (N, 3, 3)."""
+    return np.asarray(np.einsum('nc,ncd->nd', vectors, axes))
+
+
+def axes_of(chain: Chain, observations: Observations) -> FloatArray:
+    """Return the axes (N, 3, 3) of the arm's base in those of the residuals."""
+    base = chain.frame(observations.base).matrix[:3, :3]
+    if not observations.seen:
+        return np.tile(base, (len(observations), 1, 1))
+    seen = chain.forward(
+        observations.joints, observations.approach, observations.base, observations.tool
+    )
+    return np.asarray(np.swapaxes(seen[:, :3, :3], 1, 2) @ base)
 
 
 def joined(

@@ -85,7 +85,7 @@ def in_any_order(chain: Chain, seen: Observations, of_images: bool) -> Iterator[
     orders = np.array([*permutations(range(count))])
     arm = replace(chain, base=None, tool=None).forward(few.joints[:, orders].reshape(-1, count))
     reached = arm[:, :3, 3].reshape(len(few), len(orders), 3)
-    measured = (few.inverted() if few.inverse else few).positions[:, np.newaxis]
+    measured = few.given[:, np.newaxis]
     steps = (np.linalg.norm(np.diff(each, axis=0), axis=2) for each in (reached, measured))
     away = np.median(np.abs(np.subtract(*steps)), axis=0)
     for order in orders[np.argsort(away)[: SEVERAL * TRIED]]:
@@ -102,7 +102,7 @@ def dead(chain: Chain, sets: Sets) -> Suspect | None:
     for each in sets:
         if each.socket or len(each) < TELLING:
             continue
-        seen = (each.inverted() if each.inverse else each).positions
+        seen = each.given
         held = np.flatnonzero(np.ptp(seen, axis=0) == 0.0)
         places = replace(chain, tool=None).forward(each.joints)[:, :3, 3]
         spreads = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
@@ -128,10 +128,10 @@ def repeating(
         return None
     arm = flange(chain, seen)
     far = misses(chain, seen, arm) > largest
-    poses = np.column_stack([seen.positions, seen.rotations.reshape(-1, 9)])
+    poses = np.column_stack([seen.given, seen.rotations.reshape(-1, 9)])
     for what, values, others in (
         ('the measurement is', poses, arm[:, :3, 3]),
-        ('the joint values are', seen.joints, seen.positions),
+        ('the joint values are', seen.joints, seen.given),
     ):
         moved = np.linalg.norm(np.diff(others, axis=0), axis=1) > largest
         again = (np.diff(values, axis=0) == 0.0).all(axis=1)

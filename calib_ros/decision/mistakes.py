@@ -291,7 +291,7 @@ def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> E
     if len(sets) > 1 or sets[0].socket or _of_images(problem):
         return None
     whole = _moved(problem, sets[0], 0)
-    rows, third, sizes = np.arange(len(whole)), len(whole) // 3, norms(whole.positions)
+    rows, third, sizes = np.arange(len(whole)), len(whole) // 3, norms(whole.given)
     order = np.sort(sizes)
     least = order[:-1].max(initial=0.0, where=order[1:] > CLEARLY * order[:-1])
     parts = [sizes <= least]
@@ -392,7 +392,8 @@ def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
     order = np.argsort(np.concatenate([e.stamps_ns for e in parts]), kind='stable')
     measured, reported = (slice(max(0, n), min(0, n) or None) for n in (-rows, rows))
     joined: dict[str, Any] = {}
-    for name in ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented'):
+    names = ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented')
+    for name in (*names, *(('points',) * each.seen)):
         ordered = np.concatenate([getattr(e, name) for e in parts])[order]
         joined[name] = ordered[reported if name == 'joints' else measured]
     kept = {name: getattr(each, name) for name in ('base', 'tool', 'socket', 'inverse')}

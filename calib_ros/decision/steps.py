@@ -370,7 +370,8 @@ def _groups(problem: Problem) -> list[_Group]:
     for kind in ('base', 'tool'):
         for frame in dict.fromkeys(getattr(each, kind) for each in problem.sets):
             sets = [k for k, each in enumerate(problem.sets) if getattr(each, kind) == frame]
-            socket = kind == 'base' and problem.sets[sets[0]].socket  # the ball turns in it
+            seen = problem.sets[sets[0]]
+            socket = kind == 'base' and (seen.socket or seen.seen)  # the ball turns in it
             names = parameters_of(frame)[: 3 if socket else 6]
             found.append(_Group(frame, kind, names, tuple(sets), problem.model.frame(frame).fixed))
     joints, everywhere = problem.chain.joints, tuple(range(len(problem.sets)))

@@ -45,6 +45,12 @@ UNITS = (('mm', 'mm', 1e-3), ('cm', 'cm', 1e-2), ('in', 'inches', 0.0254), ('ft'
 """Units of lengths, in words, and their sizes [m]."""
 FIRST = ('measured', 'handed', 'order')
 """Parts whose mistakes are undone before those of single joints."""
+BACK = (Observations.inverted,)
+"""Change between what a camera on the flange measured and what is fitted."""
+ON_FLANGE = (
+    'the positions are of a fixed point, seen by a camera on the flange',
+    '--eye-in-hand',
+)
 NOT_ON_FLANGE = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
 
 
@@ -69,16 +75,19 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
         return
     if not any(each.socket for each in sets):
         (seen,) = sets
-        ways = _conventions(chain, seen) if seen.oriented.any() else ()
-        yield from (replace(each, part='measured') for each in (*_units(chain), *ways))
-        yield from _of_coordinates(seen)
+        back = BACK * seen.seen
+        for each in _units(chain):
+            yield replace(each, part='measured', changes=(*back, *each.changes, *back))
         if seen.oriented.any():
+            yield from (replace(each, part='measured') for each in _conventions(chain, seen))
             yield from _misread(chain, seen)
+        else:
+            what, remedy = NOT_ON_FLANGE if seen.seen else ON_FLANGE
+            yield Suspect(what, remedy, BACK, published=_in_sources(not seen.seen))
+        yield from _of_coordinates(seen)
         remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
         what = 'the axes of the measuring device are left-handed'
-        yield Suspect(what, remedy, (mirrored,), 3, part='handed')
-        if not seen.oriented.any():
-            yield from _of_points(chain)
+        yield Suspect(what, remedy, (*back, mirrored, *back), 3, part='handed')
     yield from _of_places(chain)
 
 
@@ -108,7 +117,7 @@ def _of_boards(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     what, remedy = 'the camera is on the flange', '--eye-in-hand (or eye_in_hand)'
     if seen.inverse:
         what, remedy = NOT_ON_FLANGE
-    yield Suspect(what, remedy, (Observations.inverted,), published=_in_sources(not seen.inverse))
+    yield Suspect(what, remedy, BACK, published=_in_sources(not seen.inverse))
     size = size_of(chain, seen)
     remedy = 'measure the print, and give square and marker in metres'
     what = f'the board is stated {float(f"{1.0 / size:.3g}"):g} times as large as it is'
@@ -152,7 +161,7 @@ def _of_lengths(key: str, columns: Sequence[str], change: Rescaled) -> Iterator[
 
 def _of_coordinates(seen: Observations) -> Iterator[Suspect]:
     """Yield other axes of the positions alone, and units of one coordinate."""
-    back = (Observations.inverted,) if seen.inverse else ()
+    back = BACK * seen.inverse
     for signs, order in product(product((1, -1), repeat=3), permutations(range(3))):
         if seen.oriented.any() and ({*signs} == {1}) != (order == (0, 1, 2)):
             matrix = np.diag(signs) @ np.eye(3)[[*order]]
@@ -169,26 +178,6 @@ def _of_coordinates(seen: Observations) -> Iterator[Suspect]:
             yield replace(each, changes=(*back, *each.changes, *back))
 
 
-def _of_points(chain: Chain) -> Iterator[Suspect]:
-    """Yield that positions are of a fixed point in a camera on the flange.
-
-    They fit the arm from flange to base, in the other convention.
-    """
-    if chain.held or any(joint.b or joint.beta for joint in chain.joints):
-        return
-    kinds = ('a', 'd', 'alpha', 'theta', 'sign')
-    joints = [replace(j, **{k: -getattr(j, k) for k in kinds}) for j in reversed(chain.joints)]
-    arm = replace(chain, joints=tuple(joints), convention=_other(chain), parallel=None)
-    remedy = 'measure poses there (of a board or marker), and give --eye-in-hand'
-    yield Suspect(
-        'the positions are of a fixed point, seen by a camera on the flange',
-        remedy,
-        (joints_by(np.eye(len(joints))[::-1]),),
-        chain=replace(arm, base=None, tool=None, frames=()),
-        published='publish poses of a board or marker, and set eye_in_hand=true in sources',
-    )
-
-
 def _other(chain: Chain) -> Convention:
     return 'modified' if chain.convention == 'standard' else 'standard'
 
@@ -198,7 +187,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
 
     Only if all poses have an orientation, a camera on the flange may have measured them.
     """
-    back = (Observations.inverted,) if seen.inverse else ()  # to the measured poses
+    back = BACK * seen.inverse  # to the measured poses
     ways = [
         Suspect(
             'the quaternions are w x y z, not x y z w',
@@ -222,7 +211,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     elif seen.oriented.all():
         what = 'the poses are of the world in the target, as from a camera on the flange'
         remedy = '--eye-in-hand (or --inverse, where the device stands)'
-        ways.append(Suspect(what, remedy, (Observations.inverted,), published=_in_sources(True)))
+        ways.append(Suspect(what, remedy, BACK, published=_in_sources(True)))
     in_mm, degrees = lengths(chain, 1e-3), of_kind(chain, 'revolute', np.radians(1.0))
     for way in ways:
         yield replace(way, changes=(*back, *way.changes))
@@ -256,7 +245,7 @@ def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:
         return float(np.median(np.abs(se3.angles_between(some[:-1], some[1:]) - between)))
 
     largest = NEARER * max(away(seen), float(np.median(between)))
-    back = (Observations.inverted,) if seen.inverse else ()
+    back = BACK * seen.inverse
     for what, remedy, turn in misread():
         found = Suspect(what, remedy, (*back, with_turn(turn), *back), 2)
         if away(*found.undone((seen,))) < largest:

@@ -71,7 +71,8 @@ def trial_of(chain: Chain, sets: Sets) -> Trial | None:
             found = best, _nearest(own, alone, arm, usual)
             best = min(filter(None, found), key=lambda one: one.error)
         places = arm[:, :3, 3]
-        seen = places if each.socket else each.positions  # sockets measure nothing
+        fixed = each.socket or each.seen
+        seen = places if fixed else each.positions  # sockets measure nothing
         spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (places, seen)))
         chain = chain.with_frame(each.base, best.chain.frame('base'))
         chain = chain.with_frame(each.tool, best.chain.frame('tool'))
@@ -169,7 +170,10 @@ def refined(problem: Problem, trial: Trial) -> Trial:
 def misses(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
     """Return the errors (N,) [m] of samples, given the poses (N, 4, 4) of the bare arm."""
     found = chain.frame(each.base).matrix @ arm @ chain.frame(each.tool).matrix
-    away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
+    left = each.positions - found[:, :3, 3]
+    if each.seen:
+        left = left - np.einsum('nij,nj->ni', found[:, :3, :3], each.given)
+    away = np.linalg.norm(left, axis=1)
     if each.oriented.any():
         turns = se3.angles_between(found[:, :3, :3], each.rotations)
         away = away + LEVER * np.where(each.oriented, turns, 0.0)

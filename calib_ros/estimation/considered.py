@@ -206,7 +206,7 @@ def bends(sets: Sequence[Samples]) -> list[FloatArray]:
         device = [sets[number] for number in own]
         weights = [np.ones(s.count) if s.weights is None else s.weights for s in device]
         shown = [samples.observations for samples in device]
-        places = [(each.inverted() if each.inverse else each).positions for each in shown]
+        places = [each.given for each in shown]
         waves = _polynomials(np.concatenate(places), np.concatenate(weights))
         ends = np.cumsum([samples.count for samples in device])[:-1]
         parts = dict(zip(own, np.split(waves, ends, axis=1), strict=True))

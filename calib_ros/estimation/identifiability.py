@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from calib_ros.estimation.sizes import TYPICAL
+from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -74,6 +75,7 @@ class Kind:
     tool: str = 'tool'
     socket: bool = False
     plane: bool = False
+    seen: bool = False
 
     @property
     def rows(self) -> int:
@@ -94,8 +96,9 @@ def structurally_independent(
     minimal model of an arm with R revolute and P prismatic joints has 4 R + 2 P + 6 parameters by
     full pose (Everett, Driels and Mooring 1987). A target in a socket is in one place in all
     poses: turning the whole cell about it only shows in residuals. So does the size of a cell that
-    touches only planes. A board gives its pose in a camera, and images from anywhere give the
-    camera's lens (Zhang 2000). `extra` returns further equations at a chain.
+    touches only planes, and turning the cell about a point seen from the flange. A board gives its
+    pose in a camera, and images from anywhere give the camera's lens (Zhang 2000). `extra` returns
+    further equations at a chain.
 
     Parameters of which those before them leave little come last: with a known tool near the last
     axis a turn would else imitate a length, and end far away.
@@ -133,7 +136,10 @@ def drawn(
             line /= np.linalg.norm(line, axis=1, keepdims=True)
             jacobian = np.einsum('nc,ncp->np', line, jacobian[:, :3])
         elif not kind.oriented:
-            jacobian = jacobian[:, :3]
+            jacobian, turns = jacobian[:, :3], jacobian[:, 3:]
+            if kind.seen:  # the point is the world's origin
+                places = anywhere.forward(posed, signs, kind.base, kind.tool)[:, :3, 3]
+                jacobian = jacobian + se3.skew(places) @ turns
         rows.append(jacobian.reshape(-1, len(names)))
     return anywhere, rows
 

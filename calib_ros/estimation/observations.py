@@ -72,7 +72,8 @@ class Observations(Shown):
     points: FloatArray | None = None
     """(N, 2) [px] and (N, 3) [m]: points of a board in images, one a row, with the place in the
     image and in the board frame. Rows of one image are consecutive and share stamp and joint
-    values. Positions and rotations are then ignored."""
+    values. Positions and rotations are then ignored. Points alone are one fixed point, the origin
+    of the world, in the frame of a camera on the flange; positions are then zero."""
     on_flange: bool = False
     """The camera is on the flange, at `tool`, and the board is the world. Otherwise the camera is
     the world and the board is at `tool`."""
@@ -83,8 +84,10 @@ class Observations(Shown):
         check_fields(self)
         if self.plane and self.distances is None:
             raise InputError('a plane needs the heights over it as distances, zero where touched')
-        if (self.pixels is None) != (self.points is None):
-            raise InputError('pixels and the board points they show must be given together')
+        if self.pixels is not None and self.points is None:
+            raise InputError('pixels need the board points they show')
+        if self.seen and not self.inverse:
+            raise InputError('points need their pixels; of a camera on the flange use inverted()')
         count, joints = len(self.stamps_ns), self.joints.shape[-1]
         for name, array in self._arrays().items():
             shape = (count, *(joints if size is None else size for size in _SHAPES[name]))
@@ -197,13 +200,18 @@ class Observations(Shown):
         The pose of the target in the camera becomes the pose of the camera in the target frame,
         the new world. Covariances are transformed too. `sigmas` (position [m], orientation [rad])
         replace missing ones, because the uncertainty of the inverse includes the orientation's
-        sigma times the distance.
+        sigma times the distance. Positions alone become points in the frame of the camera.
         """
-        if not self.oriented.all():
+        if self.distances is not None or self.oriented.any() > self.oriented.all():
             raise InputError(
-                'poses of a camera on the flange need an orientation (qx qy qz qw): without it '
-                'they cannot be inverted'
+                'a camera on the flange measures poses or positions, all with an orientation (qx '
+                'qy qz qw) or none'
             )
+        if not self.oriented.all():
+            given, points = self.points, None
+            if given is None:
+                given, points = np.zeros_like(self.positions), self.positions
+            return replace(self, positions=given, points=points, inverse=not self.inverse)
         turned = np.swapaxes(self.rotations, 1, 2)
         positions = -np.einsum('nij,nj->ni', turned, self.positions)
         covariance = self.covariance if sigmas is None else self.covariances(sigmas)
@@ -253,6 +261,16 @@ class Observations(Shown):
             joints = joints + 0.5 * more**2 * self.acceleration
             velocity = velocity - more * self.acceleration
         return replace(self, joints=joints, velocity=velocity, delay=delays)
+
+    @property
+    def given(self) -> FloatArray:
+        """Return the positions (N, 3) [m] as the device gave them, on the flange too."""
+        return (self.inverted() if self.inverse else self).positions
+
+    @property
+    def seen(self) -> bool:
+        """Tell whether the positions are of a fixed point, seen by a camera on the flange."""
+        return self.points is not None and self.pixels is None
 
     @property
     def moving(self) -> bool:

@@ -217,6 +217,7 @@ class Problem(Shown):
                 each.tool,
                 each.socket,
                 each.plane,
+                each.seen,
             )
             for each in self.sets
         )

@@ -3,11 +3,12 @@
 """Samples of one set of observations for the solver: weighted rows, block by block.
 
 Residual of a sample: p_measured - p and the rotation vector from the model's orientation to the
-measured one, both in world axes, weighted by the inverse covariance of the measurement. Its
-derivative by the parameters is minus that of the error model. The orientation part omits the
-Jacobian of the logarithm, which leaves the residual itself unchanged: with equal weights on the
-three axes the gradient is the same. A measured distance has the residual L - |p|, and its
-derivative is the position's along p. Pixels of a board are in `pixels.py`.
+measured one, both in world axes, weighted by the inverse covariance of the measurement; of a point
+seen from the flange, in the axes of the camera, as its covariance. Its derivative by the
+parameters is minus that of the error model. The orientation part omits the Jacobian of the
+logarithm, which leaves the residual itself unchanged: with equal weights on the three axes the
+gradient is the same. A measured distance has the residual L - |p|, and its derivative is the
+position's along p. Pixels of a board are in `pixels.py`.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ class Samples:
         self.count = len(observations)
         self.joints = np.ascontiguousarray(observations.joints.T)
         self.positions = np.ascontiguousarray(observations.positions.T)
+        self.seen = np.ascontiguousarray(observations.given.T) if observations.seen else None
         approach = observations.approach
         self.approach = None if approach is None else np.ascontiguousarray(approach.T)
         self.distances = observations.distances
@@ -146,13 +148,18 @@ class Samples:
                 out = None  # the last is shorter
             approach = None if self.approach is None else self.approach[:, part]
             moving = None if velocity is None else velocity[:, part]
-            axes, origin, *found, phi = model.linearise(joints[:, part], approach, moving, out)
+            seen = None if self.seen is None else self.seen[:, part]
+            axes, origin, *found, phi = model.linearise(
+                joints[:, part], approach, moving, out, seen
+            )
             out = found[0], found[1]
             shift = found[0]
             if self.distances is not None:
                 shift = _along(origin, shift, self.distances[part], self.observations.plane)
             else:
                 np.subtract(self.positions[:, part], origin, out=shift[-1])
+            if seen is not None:
+                shift = np.einsum('kcb,pcb->pkb', axes, shift)
             weights = 1.0 if self.weights is None else self.weights[part]
             if not self.oriented and self.whitening is None:
                 shift *= weights / self.sigmas[0]
@@ -280,6 +287,7 @@ def residual_arrays(chain: Chain, observations: Observations) -> Both:
     then = observations.earlier(chain.frame(observations.base).delay)
     distances = observations.distances
     position = np.empty((len(then), 3 if distances is None else 1))
+    given = observations.given if observations.seen else position
     orientation = np.full((len(then), 3), np.nan)
     oriented = observations.oriented & (distances is None)
     for start in range(0, len(then), BLOCK):
@@ -292,6 +300,9 @@ def residual_arrays(chain: Chain, observations: Observations) -> Both:
             position[part, 0] = distances[part] - length
             continue
         position[part] = observations.positions[part] - origin.T
+        if observations.seen:
+            position[part] = np.einsum('kcn,nc->nk', axes, position[part])
+            position[part] -= given[part]
         if oriented[part].any():
             measured = np.ascontiguousarray(observations.rotations[part].transpose(2, 1, 0))
             orientation[part] = orientation_error(measured, axes).T

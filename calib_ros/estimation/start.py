@@ -131,7 +131,8 @@ def _start_one(
 ) -> Chain:
     oriented = bool(observations.oriented.any()) and observations.distances is None
     every = movable(chain, ('base', 'tool'))
-    names = [name for name in every if oriented or name.owner == 'base' or name.is_length]
+    whole = oriented or observations.seen
+    names = [name for name in every if whole or name.owner == 'base' or name.is_length]
     if not names:
         return chain
     if observations.socket:
@@ -142,7 +143,8 @@ def _start_one(
         start = _trilaterated(chain, flange(chain, subset), subset)
         lengths = [name for name in names if name.is_length]
         return thorough_fit(start, lengths, system, loss).fit.chain
-    spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
+    places = subset.given if subset.seen else subset.positions
+    spread = float(np.sqrt(np.var(places, axis=0).sum()))
     determined: tuple[str, ...] = ()
     best, least, left = chain, np.inf, np.full_like(subset.positions, np.inf)
     for starts in _starts(chain, subset):
@@ -269,12 +271,12 @@ def _closed_form(
     chain: Chain, arm: FloatArray, observations: Observations
 ) -> Iterator[FloatArray]:
     """Yield rotations of the base (3, 3) from the given frames and closed forms."""
-    if observations.socket:
+    if observations.socket or (observations.seen and chain.base is None):
         yield np.eye(3)  # the world's axes are the base's
         return
     if chain.base is not None:
         yield chain.base.matrix[:3, :3]
-        if chain.base.fixed:
+        if chain.base.fixed or observations.seen:
             return
     oriented = observations.oriented
     if oriented.any():
@@ -313,7 +315,13 @@ def _complete(
         )
     # p = R_B p_K + R_B R_K t + b, with b and t unknown unless their frame is fixed
     turned = rotation @ arm[:, :3, :3]
-    wanted = observations.positions - arm[:, :3, 3] @ rotation.T - turned @ tool_matrix[:3, 3]
+    wanted = observations.positions - arm[:, :3, 3] @ rotation.T
+    if observations.seen:
+        if not tool.fixed:
+            left = wanted - base_matrix[:3, 3] * base.fixed
+            tool_matrix[:3, :3] = _towards(turned, observations, left, not base.fixed)
+        wanted -= np.einsum('nij,nj->ni', turned @ tool_matrix[:3, :3], observations.given)
+    wanted -= turned @ tool_matrix[:3, 3]
     if not tool.fixed:
         left = wanted - base_matrix[:3, 3] if base.fixed else wanted
         shift = _shortest(turned, left, not base.fixed)
@@ -321,6 +329,22 @@ def _complete(
         wanted -= turned @ shift
     base_matrix[:3, 3] = wanted.mean(axis=0)
     return _placed(chain, base_matrix, tool_matrix)
+
+
+def _towards(
+    turned: FloatArray, observations: Observations, wanted: FloatArray, free: bool
+) -> FloatArray:
+    """Return the rotation (3, 3) of a camera that sees one point, at flange rotations (N, 3, 3).
+
+    R_i (R m_i + t) + b = wanted (N, 3) is linear in R, t and, if `free`, b.
+    """
+    columns = [
+        np.einsum('nij,nk->nijk', turned, observations.given).reshape(-1, 9),
+        turned.reshape(-1, 3),
+    ]
+    columns += [np.tile(np.eye(3), (len(turned), 1))] * free
+    found = np.linalg.lstsq(np.concatenate(columns, axis=1), wanted.ravel(), rcond=1e-9)[0]
+    return se3.nearest_rotation(found[:9].reshape(3, 3))
 
 
 def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:

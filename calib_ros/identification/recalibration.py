@@ -199,7 +199,7 @@ def _may_be_scaled(chain: Chain, sets: Sequence[Observations]) -> bool:
     if others or linear or chain.frame(base).fixed:
         return False
     return all(
-        each.distances is None and each.pixels is None and not (each.socket or each.inverse)
+        each.distances is None and each.points is None and not (each.socket or each.inverse)
         for each in sets
     )
 

@@ -80,21 +80,24 @@ class ErrorModel:
         approach: FloatArray | None = None,
         velocity: FloatArray | None = None,
         out: tuple[FloatArray, FloatArray] | None = None,
+        points: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return axes (3, 3, B), origin (3, B) [m] and derivatives of the target for one block.
 
         `q` (n, B) [rad or m] are joint values, `approach` (n, B) signs of the preceding
-        velocities, for backlash, `velocity` (n, B) those for the delay of the device. The first
-        index of the axes counts them. The derivatives are `shift` (K + 1, 3, B) of the position,
-        rotations first, and `turn` (K_rotational + 1, 3, B) of the orientation as a rotation
-        vector in the world; their last row is free for the residual. They are written to `out`, if
-        given, to reuse memory. All effects of a joint share the row of its motion, to be
-        multiplied by their `phi` (E, B).
+        velocities, for backlash, `velocity` (n, B) those for the delay of the device, `points` (3,
+        B) [m] the target in the frame of the tool. The first index of the axes counts them. The
+        derivatives are `shift` (K + 1, 3, B) of the position, rotations first, and `turn`
+        (K_rotational + 1, 3, B) of the orientation as a rotation vector in the world; their last
+        row is free for the residual. They are written to `out`, if given, to reuse memory. All
+        effects of a joint share the row of its motion, to be multiplied by their `phi` (E, B).
         """
         layout, walk, samples = self._layout, self.chain.walk, q.shape[1]
         names = tuple(dict.fromkeys((*layout.effects, *(n for n, v in self.chain.effects if v))))
         phi = effects.basis(self.chain, names, q, approach)
         frames, target = self._frames(effects.moved_joints(self.chain, names, phi, q))
+        if points is not None:
+            target[3] += np.einsum('kcb,kb->cb', target[:3], points)
         flat = frames.reshape(4 * len(frames), 3, samples)
         shift, turn = out or (
             np.empty((self.motions + 1, 3, samples)),

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.decision.comparison import Comparison
+from calib_ros.decision.comparison import Comparison, axes_of, by_axes
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.observations import Observations
@@ -139,10 +139,9 @@ def _poses(
             each = samples.observations
             rows = slice(first, first + len(each))
             first = rows.stop
-            base = chain.frame(each.base).matrix
-            turn = base[:3, :3]
+            base, turn = chain.frame(each.base).matrix, axes_of(chain, each)
             reached = chain.forward(each.joints, each.approach, each.base, each.tool)
-            along = np.eye(3) if each.distances is not None else turn
+            along = turn if each.distances is None else np.tile(np.eye(3), (len(each), 1, 1))
             left = after.position[rows] if each.pixels is None else after.pixels[rows]
             left = left[:, :1] if each.distances is not None else left
             parts_in_sigma = samples.in_sigma(left, after.orientation[rows])
@@ -151,11 +150,11 @@ def _poses(
             part = {
                 'joints': each.joints,
                 'stamps_ns': each.stamps_ns,
-                'position': (reached[:, :3, 3] - base[:3, 3]) @ turn,
-                'before': before.position[rows] @ along,
-                'after': after.position[rows] @ along,
-                'turned_before': before.orientation[rows] @ turn,
-                'turned_after': after.orientation[rows] @ turn,
+                'position': (reached[:, :3, 3] - base[:3, 3]) @ base[:3, :3],
+                'before': by_axes(before.position[rows], along),
+                'after': by_axes(after.position[rows], along),
+                'turned_before': by_axes(before.orientation[rows], turn),
+                'turned_after': by_axes(after.orientation[rows], turn),
                 'in_sigma': in_sigma,
                 'role': role[rows],
                 'outlier': ~comparison.judged[rows],

@@ -107,7 +107,7 @@ def residual_markers(
     lines.scale.x = 0.002
     base = result.chain.frame('base').matrix
     for each in sets:
-        if each.distances is not None or each.pixels is not None:
+        if each.distances is not None or each.points is not None:
             continue
         left = residuals(result.chain, each).position
         size = np.linalg.norm(left, axis=1)

@@ -5,11 +5,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from fits import UR10E
 
 from calib_ros.apply.simulation import random_frame
-from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics import se3
 
@@ -51,10 +49,3 @@ def test_covariances_are_inverted_by_the_numeric_jacobian(rng):
         jacobian = (ahead - behind).T / 2e-6
         found = replace(seen, covariance=covariance[None]).inverted().covariance[0]
         np.testing.assert_allclose(found, jacobian @ covariance @ jacobian.T, rtol=0, atol=1e-6)
-
-
-def test_positions_cannot_be_inverted(rng):
-    """The camera's place in the target's frame needs the orientation."""
-    seen = Observations.from_arrays(UR10E.random_joints(5, rng), rng.normal(size=(5, 3)))
-    with pytest.raises(InputError, match='orientation'):
-        seen.inverted()

@@ -250,8 +250,10 @@ def test_pixels_without_a_lens_are_refused():
     _, seen = scene(1, False, 3)
     with pytest.raises(InputError, match=r'need the intrinsics of their camera \(base\)'):
         Problem(UR, seen)
-    with pytest.raises(InputError, match='pixels and the board points'):
+    with pytest.raises(InputError, match='pixels need the board points'):
         replace(seen, points=None)
+    with pytest.raises(InputError, match='points need their pixels'):
+        replace(seen, pixels=None)
     with pytest.raises(InputError, match='pixels of 72 observations'):
         Observations.from_pixels(seen.joints, seen.pixels[:, :1], seen.points, seen.images)
 

@@ -121,7 +121,7 @@ def test_workbooks(tmp_path, monkeypatch):
     for rows, said in (
         ([], 'has no rows'),
         ([['q'] * (MOST_ENTRIES + 1)], f'has {MOST_ENTRIES + 1} columns, more than'),
-        ([[*NAMES, 'e'], [1, 2, 3, 4, 5, True]], 'of a camera on the flange need an orientation'),
+        ([[*NAMES, 'e'], [1, 2, 3, 4, 5, 'no']], 'eye_in_hand'),
     ):
         book = openpyxl.Workbook()
         for row in rows:
