@@ -147,14 +147,15 @@ def test_a_joint_that_was_bumped_is_named(nights):
     assert back.changed[0][0].change[0] == pytest.approx(-reason.change[0], abs=5e-5)
 
 
-def test_a_change_of_a_pure_number_has_a_unit_that_exists():
-    """It was "m1"."""
+@pytest.mark.parametrize('fixed', [(), UR.parameter_names[12:]])
+def test_a_change_of_a_pure_number_has_a_unit_that_exists(fixed):
+    """It was "m1". Alone it is no change of a joint, a frame or the load."""
     arm, pair = UR.with_effects([ratio := 'elbow_joint.ratio']), []
     for seed, size in enumerate((1e-3, 2e-3)):
         rng = np.random.default_rng(seed)
         true = arm.with_effect_values({ratio: size})
         seen = measure(true, UR.random_joints(60, rng), rng, *NOISE)
-        pair.append(Calibration.of(identify(Problem(arm, seen))))
+        pair.append(Calibration.of(identify(Problem(arm, seen, fixed=fixed))))
     (name, size), *_ = difference(*pair).rows()
     assert name == ratio
     assert re.fullmatch(r'\+[01]\.\d{3} ± 0\.\d{3} ‰ \(95 %\)', size)
