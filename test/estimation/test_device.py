@@ -9,7 +9,8 @@ import pytest
 from measured import bent
 
 from calib_ros import Observations, Problem, identify, load_chain
-from calib_ros.estimation.considered import bends
+from calib_ros.estimation.considered import Doubts, bends, doubted_products
+from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.samples import Samples
 
 ARM = load_chain('ur10')
@@ -20,6 +21,10 @@ def seen(count=50, **more):
     q = ARM.random_joints(count, np.random.default_rng(1))
     pose = ARM.forward(q)
     return replace(Observations.from_arrays(q, pose[:, :3, 3], pose[:, :3, :3]), **more)
+
+
+def covariance():
+    return np.diag([SIGMA**2] * 3 + [1e-6] * 3) * np.ones((50, 1, 1))
 
 
 def samples(observations, weights=None):
@@ -43,9 +48,8 @@ def test_the_errors_of_a_device_are_not_taken_for_those_of_an_arm(name, seed):
 
 
 @pytest.mark.parametrize('weighted', [False, True])
-@pytest.mark.parametrize('covariance', [False, True])
-def test_errors_of_a_device_are_as_large_as_its_sigma(weighted, covariance):
-    own = np.diag([SIGMA**2] * 3 + [1e-6] * 3) * np.ones((50, 1, 1)) if covariance else None
+@pytest.mark.parametrize('own', [None, covariance()])
+def test_errors_of_a_device_are_as_large_as_its_sigma(weighted, own):
     weights = np.linspace(0.0, 1.0, 50) if weighted else np.ones(50)
     (rows,) = bends([samples(seen(covariance=own), weights)])
     assert len(rows) == 27
@@ -66,18 +70,24 @@ def test_it_bends_what_it_sees_and_leaves_alone_what_the_frames_take_up():
             assert told == pytest.approx(share, abs=1e-9)
 
 
+def test_it_turns_nothing():
+    """Rows of position and orientation apart tell what those of whole poses do."""
+    names, found = ARM.parameter_names[::3], []
+    for own in (None, covariance()):
+        system = System((samples(seen(covariance=own)),))
+        found.append(doubted_products(ARM, names, system, Doubts(by_device=True)))
+    np.testing.assert_allclose(found[0].cross, found[1].cross, atol=1e-6)
+    np.testing.assert_allclose(found[0].doubtful, found[1].doubtful, atol=1e-9)
+
+
 def test_a_camera_on_the_flange_bends_what_it_sees_itself():
     plain = seen()
     (rows,) = bends([samples(plain)])
     (turned,) = bends([samples(plain.inverted())])
     there = np.einsum('nji,kjn->kin', plain.rotations, rows[:, :3])  # in the frame of the target
-    for each in there:
-        left = (
-            each.ravel()
-            - turned[:, :3].reshape(27, -1).T
-            @ np.linalg.lstsq(turned[:, :3].reshape(27, -1).T, each.ravel(), rcond=None)[0]
-        )
-        assert np.abs(left).max() < 1e-9
+    flat, wanted = (each[:, :3].reshape(27, -1).T for each in (turned, there))
+    left = wanted - flat @ np.linalg.lstsq(flat, wanted, rcond=None)[0]
+    assert np.abs(left).max() < 1e-9
 
 
 def test_devices_have_their_own_errors_and_targets_of_one_have_them_in_common():
