@@ -230,8 +230,7 @@ def test_a_full_disk_loses_nothing(tmp_path):
         assert archive.trouble.startswith('poses are in memory only: the disk is full: make room')
         archive.remove(samples[1])
         archive.remove(samples[3])
-    archive.write()
-    assert archive.error == ''
+    assert archive.close() == archive.trouble == archive.error == ''
     assert stamps(tmp_path) == [1, 3, 5, 6, 7]
 
 

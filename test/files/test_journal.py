@@ -150,6 +150,7 @@ def test_of_rows_alike_the_last_is_taken_back_and_the_rest_keep_their_order(tmp_
     for change, left in (
         ({'removed': True}, [many[0], many[1]]),
         ({'removed': True}, [many[1]]),
+        ({'removed': True}, [many[1]]),  # as of a row that an editor took out
         ({}, [many[1], many[0]]),
     ):
         journal.add(many[0], **change)

@@ -94,8 +94,9 @@ def test_a_chunk_that_is_cut_off_is_refused():
             messages_of(good[:length], {1: 1})
 
 
-def test_the_messages_before_a_damaged_one_are_used():
-    found, problem = messages_of(chunk(CONTENT[:-2]), {1: 'a', 3: 'c'})
+@pytest.mark.parametrize('lost', [2, 34])  # within its data, and its head
+def test_the_messages_before_a_damaged_one_are_used(lost):
+    found, problem = messages_of(chunk(CONTENT[:-lost]), {1: 'a', 3: 'c'})
     assert found == [(5, 'a', b'one'), (7, 'a', b'')]
     assert 'a record in a chunk is damaged' in str(problem)
 

@@ -176,6 +176,8 @@ def test_what_is_no_measurement_is_refused(tmp_path, rng, still, moving, source,
     assert said in refusal(path, source)
     if 'parents' in said:
         assert len(poses_of(path, '/tf parent=tracker child=tool')[0]) == 1
+    (path / 'metadata.yaml').unlink()  # as of a bag that was not closed
+    assert said in refusal(path, source)
 
 
 def test_a_link_that_has_changed_is_refused(tmp_path, rng):
