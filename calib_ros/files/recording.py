@@ -107,7 +107,7 @@ def _write_bag(path: Path, recording: Recording, storage: str, progress: Notify)
             stamp_ns = int(stamps[k])
             pose = k - len(recording.joints)
             if pose < 0:
-                values = np.ascontiguousarray(recording.joints[k])
+                values = recording.joints[k]
                 message = joint_state(head(stamp_ns, ''), names, values, none, none)
                 connection = joint_connection
             else:

@@ -13,6 +13,7 @@ from urdfs import UR10E
 from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.files import export
 from calib_ros.files.export import (
+    FILES,
     ExportError,
     converted,
     exports,
@@ -55,6 +56,7 @@ def scara():
 def test_every_form_says_how_far_it_is_from_the_calibration(name):
     nominal, chain = corrected(name)
     by_name = {each.name: each for each in exports(chain, nominal)}
+    assert {*by_name} == {*FILES}  # which the command replaces
     assert by_name['dh_standard.csv'].error == by_name['kinematics.yaml'].error == 0.0
     offsets = by_name['joint_offsets.csv']
     assert 1e-4 < offsets.error < 0.02
@@ -162,7 +164,7 @@ def test_a_table_is_as_near_as_it_says_without_frames_that_it_does_not_hold(name
 def test_a_table_without_beta_has_none_of_the_nominal_table_either():
     nominal, _ = tilted()
     nominal = nominal.with_offsets({'j3.beta': 0.01})
-    found = exports(nominal.with_offsets({'j3.beta': 1e-3}), nominal)
+    found = exports(nominal.with_offsets({'j3.beta': 1e-3}), nominal, np.eye(4))  # of 4 poses
     (text,) = (each.content for each in found if each.name == 'dh_without_beta.csv')
     assert {float(row['beta']) for row in csv.DictReader(text.splitlines()[1:])} == {0.0}
 
