@@ -13,9 +13,7 @@ from calib_ros.sampling.slices import JOINTS, POSES
 
 LOST = 'were dropped (stamps or full buffers)'
 ALLOW = 'accept the rest with largest_loss (--largest-loss)'
-_LOSS = re.compile(
-    '(?!.*(same stamp twice|already exists|: in frame ")).*(stamp|lateness|buffer full|memory)'
-)
+_LOSS = re.compile('(?!.*(same stamp twice|: in frame ")).*(stamp|lateness|buffer full|memory)')
 
 
 @dataclass(frozen=True)

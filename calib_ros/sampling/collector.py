@@ -20,7 +20,7 @@ from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.buffers import Rows, Waiting
 from calib_ros.sampling.hints import Hint, apart, ended, restless, sparse
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.sampler import ROW_WIDTH, Found, Numbered, Sampler
+from calib_ros.sampling.sampler import ROW_WIDTH, TWICE, Found, Numbered, Sampler
 from calib_ros.sampling.slices import (
     JOINTS,
     NO_ACCIDENT,
@@ -36,7 +36,6 @@ from calib_ros.settings import Settings
 from calib_ros.values import MOST_NAMES
 
 REST_S = 0.5 * Settings.shortest_stop  # time [s] without motion after which joints stand
-TWICE = 'same stamp twice'
 CONTRARY = 'different values with the same stamp (two publishers, or stamps too coarse?)'
 ADVANCE_NS = round(5e9 * REST_S)  # time between two rounds of sampling, by joint stamps
 

@@ -27,6 +27,7 @@ ROW_WIDTH = COVARIANCE_SLICE.stop
 Numbered: TypeAlias = tuple[int, Sample]  # A sample with the number of its round or stop
 VIBRATING = 'measurements: still vibrating, or a spike'
 RESTLESS = 'measurements: a stop with more spread than noise'
+TWICE = 'same stamp twice'
 
 
 class Found(NamedTuple):
@@ -179,8 +180,7 @@ class Sampler:
         free = self._free(key, stamp_ns, joints)
         known = self._taken[key]
         if free is None or len(known) >= self._capacity:
-            why = 'a pose with this stamp already exists'
-            why = why if free is None else 'the memory for poses is full'
+            why = TWICE if free is None else 'the memory for poses is full'
             self.dropped[f'measurements: {why}'] += len(rows)
             return
         known[free] = joints
