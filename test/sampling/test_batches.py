@@ -121,10 +121,13 @@ def test_a_damaged_message_is_told_and_the_others_are_taken():
     stamps = [START + k * 10_000_000 for k in range(20)]
     messages = [joints(JOINTS, stamp, ARM.joint_names, np.zeros(6)) for stamp in stamps]
     messages[7] = (JOINTS, messages[7][1][:-60])
+    name = ARM.joint_names[0].encode()
+    messages[9] = (JOINTS, messages[9][1].replace(name, b'\xff' * len(name)))
     session = CalibrationSession(ARM)
-    (problem,) = feed(session, messages, TYPESTORE.deserialize_cdr)
-    assert problem == 'a message on joints cannot be decoded: it is cut off'
-    assert session.received['joints'] == 19
+    problems = feed(session, messages, TYPESTORE.deserialize_cdr)
+    assert 'a message on joints cannot be decoded: it is cut off' in problems
+    assert any("cannot be decoded: 'utf-8' codec" in each for each in problems)
+    assert (len(problems), session.received['joints']) == (2, 18)
 
 
 @pytest.mark.parametrize(('value', 'together'), [(1.79e308, True), (3.4e38, False), (-1e7, True)])

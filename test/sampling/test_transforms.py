@@ -244,6 +244,7 @@ def test_frames_without_end_are_not_remembered(rng):
     session = session_fed([*come, tf(link('tracker', 'tool', 701 * MS, frame(rng)))])
     assert session.account().samples == 5
     links = Links('/tf')
+    assert str(links) == 'nothing moves on /tf'
     at, numbers = np.zeros(1, int), np.array([[0.0] * 6 + [1.0]])
     for k in range(1500):
         links.take([Part(at, None, ('tracker', f'marker {k}'), at + k, numbers)])
