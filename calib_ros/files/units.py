@@ -61,7 +61,7 @@ class Units:
             (*slides, *SIGMAS[:3]),
         )
         angles = self._told('angle', angle, usual, (*TURNS, *IN_TURN), SIGMAS[3:])
-        said = {self._said(name) for name in angles} - {''}
+        said = set() if any(map(self._said, main)) else {*map(self._said, angles)} - {''}
         found |= angles | self._told(
             'joint-angle',
             given.get('joint_angle', '' if layout.joint_angle else angle),
