@@ -116,17 +116,16 @@ class Aim:
         columns[:, :3] = self._signs * shift[model.order]
         columns[turning, 3:] = lever * self._signs[turning] * turn[model.order[turning]]
         if self._chain.effects or self._chain.held:
-            columns = np.einsum('jib,jkb->ikb', self._effects_slope(q, approach), columns)
+            columns = np.einsum('jib,jkb->ikb', self._effects_slope(q), columns)
         turned = lever * orientation_error(axes, found) if lever else np.zeros_like(origin)
         return np.concatenate([positions - origin, turned]), columns
 
-    def _effects_slope(self, q: FloatArray, approach: FloatArray | None) -> FloatArray:
+    def _effects_slope(self, q: FloatArray) -> FloatArray:
         """Return the derivative (n, n, B) of effective by reported joint values."""
         count, step = len(q), 1e-6  # accurate to 1e-9 of the effects
         moved = np.repeat(q[:, np.newaxis], count + 1, axis=1)  # the last unchanged
         moved[np.arange(count), np.arange(count)] += step
-        signs = None if approach is None else np.tile(approach, count + 1)
-        found = self._chain.effective(moved.reshape(count, -1), signs).reshape(moved.shape)
+        found = self._chain.effective(moved.reshape(count, -1)).reshape(moved.shape)
         return np.asarray((found[:, :-1] - found[:, -1:]) / step)
 
 

@@ -11,6 +11,7 @@ from calib_ros import load_chain, read_table
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, layout_of, load_layout
+from calib_ros.files.vocabulary import SIGMAS
 
 JOINTS = np.array([[0.1, -0.2], [0.3, 0.4], [-1.5, 2.0]])
 PLACES = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 0.125], [0.0, -1.0, 1e-3]])
@@ -307,15 +308,16 @@ def test_joint_values_that_stand_a_row_below(read):
         (PLAIN, {'euler': 'XYZ', 'rotation_vector': True}, 'only one form of rotation'),
         (PLAIN, {'separator': ',', 'decimal': ','}, 'cannot separate both cells and decimals'),
         ('q1,q2,x,y,z\n1,2,3,4,5\n', {'length': 'um', 'columns': {'sx': '1'}}, 'sx, sy and sz'),
-        (PLAIN, {'columns': {f's{each}': '1' for each in ('x', 'y', 'z', 'rx')}}, 'srx, sry, srz'),
+        *((PLAIN, {'columns': dict.fromkeys(SIGMAS[:count], '1')}, 'srx, sry, srz, and rotations')
+          for count in (4, 6)),
         (PLAIN, {'columns': {'time': 'y*1e10'}}, 'line 2: time .s. must be a number of at most'),
         (PLAIN, {'euler': 'XYZ'}, 'euler is given, but no columns'),
         (PLAIN, {'columns': {'rx': 'x', 'ry': 'y'}}, 'have three columns, missing rz'),
         (DEGREES.replace('90', '1'), {'euler': 'ZXZ'}, 'an axis comes twice: give r1, r2, r3'),
         (PLAIN, {'columns': {'qx': 'x', 'qy': 'y'}}, 'four columns, missing qz, qw'),
         (DEGREES.replace('90', ''), {'euler': 'XYZ'}, 'line 2: rx.*, not blank'),
-        *((DEGREES, each, r'line 2: rx, ry, rz .* in degrees, .*--angle deg') for each in
-          ({'euler': 'XYZ'}, {'rotation_vector': True})),
+        *((DEGREES.replace('90', turn), each, r'line 2: rx, ry, rz .* in degrees, .*--angle deg')
+          for turn, each in (('90', {'euler': 'XYZ'}), ('-90', {'rotation_vector': True}))),
         (b'\xff\xfe\0\xd8', {}, 'cannot read .*: unexpected end of data'),
         (b'PK\xff\0', {}, 'not a workbook by its name: save it as .xlsx or CSV'),
         ('q1,x\n1,2\n1,2\0'.encode('utf-16'), {}, 'line 3 '),  # csv of Python 3.10 says it
