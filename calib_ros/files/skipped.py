@@ -8,8 +8,9 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import groupby, product
-from typing import TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -43,22 +44,9 @@ LEVEL = re.compile(
     rf'(?={BETWEEN}|\Z)'
 )
 """What stands beside `media` if it is a speed or load of poses."""
-Statistic: TypeAlias = Callable[[FloatArray], FloatArray]  # (C,) of columns (N, C)
-MOMENTS: tuple[Statistic, ...] = (
-    lambda columns: columns.mean(axis=0),
-    lambda columns: columns.sum(axis=0),
-    lambda columns: columns.std(axis=0),
-    lambda columns: columns.std(axis=0, ddof=1),
-)
+MOMENTS = (np.mean, np.sum, np.std, partial(np.std, ddof=1))
 """Statistics that are the values of a pose by chance only."""
-STATISTICS: tuple[Statistic, ...] = (
-    *MOMENTS,
-    lambda columns: columns.min(axis=0),
-    lambda columns: columns.max(axis=0),
-    lambda columns: np.ptp(columns, axis=0),
-    lambda columns: np.median(columns, axis=0),
-    lambda columns: np.full(columns.shape[1], len(columns)),
-)
+STATISTICS = (*MOMENTS, np.min, np.max, np.ptp, np.median, np.size)
 """Statistics that a table may have, a row each."""
 
 COMMENTS = ('#', '%', '//')
@@ -105,24 +93,20 @@ def refuse_nominal(columns: Columns, remarks: Iterable[Cells]) -> None:
 
 def measured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
     """Return the rows in which something was measured, and notes about the others."""
-    blank = [made.blank(name) for name in MEASURED_COLUMNS if name in made.cells]
-    if not blank:
-        return made, ()
-    notes, empty = [], np.logical_and.reduce(blank)
-    for rows, what in ((empty, 'nothing measured'), (_lost(made), 'no target (x = y = z)')):
-        if not rows.any():
-            continue
-        left = lines_in_words(made.lines[rows].tolist())
-        if rows.all():
-            raise InputError(f'{made.path}: {what} in {left}: rows need x, y, z or distance')
-        notes.append(f'{made.path}: {what} in {left}: skipped')
-        empty = empty | rows
-    kept = made.select(~empty) if notes else made
-    if (computed := _computed(kept)).any():
-        left = lines_in_words(kept.lines[computed].tolist())
-        notes.append(f'{made.path}: mean, sum or the like of all others in {left}: skipped')
-        kept = kept.select(~computed)
-    return kept, tuple(notes)
+    notes: list[str] = []
+    measuring = [name for name in MEASURED_COLUMNS if name in made.cells]
+    for rows_of, what in (
+        (lambda left: np.logical_and.reduce([*map(left.blank, measuring)]), 'nothing measured'),
+        (_lost, 'no target (x = y = z)'),
+        (_computed, 'mean, sum or the like of all others'),
+    ):
+        if measuring and (rows := rows_of(made)).any():
+            left = f'{made.path}: {what} in {lines_in_words(made.lines[rows].tolist())}'
+            if rows.all():
+                raise InputError(f'{left}: rows need x, y, z or distance')
+            notes.append(f'{left}: skipped')
+            made = made.select(~rows)
+    return made, tuple(notes)
 
 
 def _computed(made: Columns) -> Flags:
@@ -147,10 +131,9 @@ def _summarise(columns: FloatArray, rows: Flags) -> bool:
     given, others = columns[rows], columns[~rows]
     rounded = 0.1 * ROUNDED * others.std(axis=0)  # as means are written
 
-    def those_of(kinds: Sequence[Statistic]) -> Flags:
-        values = np.array([kind(others) for kind in kinds])
-        near = np.abs(given[:, None] - values) <= rounded
-        return np.asarray(near.all(axis=2).any(axis=1))
+    def those_of(kinds: Sequence[Callable[..., Any]]) -> Flags:
+        near = [(np.abs(given - of(others, axis=0)) <= rounded).all(axis=1) for of in kinds]
+        return np.asarray(np.any(near, axis=0))
 
     return bool(those_of(MOMENTS).any() and those_of(STATISTICS).all())
 
