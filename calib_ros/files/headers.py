@@ -36,6 +36,8 @@ from calib_ros.files.vocabulary import (
 from calib_ros.shown import some
 
 SEVERAL_POINTS = '; of several points give one, or a row for each, named in a column target'
+OTHER_ARM = 'Is it another arm (--chain)? '
+OF_ABB = 'If q1 to q4 are a quaternion, give the joint values (--joints FILE). '
 IN_ANOTHER_TABLE = '; are they in another file or sheet? Give that one, and this as --joints'
 
 
@@ -152,12 +154,5 @@ def named_by_option(
     if len(given) > LONGEST // 3:  # a message would lose its middle
         short = {name: f'#{k}' for k, name in reversed([*enumerate(header, 1)])}
         given = option(found, [short.get(each, each) for each in found.values()])
-    return f'{_of_another_arm(names, lacking) * fewer}Columns of other names: {given}{more}'
-
-
-def _of_another_arm(names: Sequence[str], lacking: Sequence[str]) -> str:
-    """Return what a table with some of the joints may be."""
-    text = 'Is it another arm (--chain)? '
-    if [*names[4:]] == [*lacking]:  # as ABB names them
-        text += 'If q1 to q4 are a quaternion, give the joint values (--joints FILE). '
-    return text
+    perhaps = OTHER_ARM + OF_ABB * ([*names[4:]] == lacking)
+    return f'{perhaps * fewer}Columns of other names: {given}{more}'

@@ -90,11 +90,12 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
         return _sheet(path, _of_text(path, layout), layout, names, known)
     faults: list[str] = []
     found: list[Sheet] = []
-    for content in _of_workbook(path, layout.sheet):
+    for title, notes, rows in sheets_of(path, layout.sheet):
+        content = _Content(iter([rows]), notes, title=title)
         try:
             sheet = _sheet(path, content, layout, names, known)
         except InputError as err:
-            faults.append(f'sheet "{content.title}": {err}')
+            faults.append(f'sheet "{title}": {err}')
             continue
         lower = [cell.lower() for cell in sheet.header]
         if names or sum(bool(places(lower, name.lower())) for name in known) > 1:
@@ -159,10 +160,11 @@ def _sheet(
     first = _first(path, head, at, used, decimal, notes)
     if at < 0:  # columns by their numbers
         header = tuple(f'#{k + 1}' for k in range(len(head[first][1])))
-    over = [cells for _, cells in head[: max(at, 0)][-1:]]
-    over = [cells for cells in over if not content.blanks or len(cells) == len(header)]
-    of_groups = [_over_groups(cells, len(header)) for cells in over]
-    header = _with_units(header, [*(cells for _, cells in head[at + 1 : first]), *of_groups])
+    beside = [cells for _, cells in head[at + 1 : first]]
+    for _, over in head[: max(at, 0)][-1:]:
+        if not content.blanks or len(over) == len(header):
+            beside.append(_over_groups(over, len(header)))
+    header = _with_units(header, beside)
     above = head[: first if at < 0 else at]
     left: list[Cells] = []
     again = [cells for _, cells in head[at:first]]
@@ -290,12 +292,6 @@ def _text(path: Path) -> tuple[str, str]:
     with suppress(UnicodeDecodeError):
         return data.decode('utf-8-sig'), ''
     return data.decode('cp1252', errors='replace'), 'Windows-1252, because it is not UTF-8'
-
-
-def _of_workbook(path: Path, name: str) -> Iterator[_Content]:
-    """Yield the sheets with rows: the one named, or the visible ones."""
-    for title, notes, rows in sheets_of(path, name):
-        yield _Content(iter([rows]), notes, title=title)
 
 
 def _separator(path: Path, text: str) -> str:
