@@ -27,15 +27,7 @@ from calib_ros.decision.steps import EXPLAINED
 from calib_ros.errors import CalibrationError, InputError
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.levels import (
-    ALIKE,
-    CERTAIN,
-    CLEARLY,
-    NEARER,
-    SURE,
-    TELLING,
-    chance_of,
-)
+from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, NEARER, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import SUSPICIOUS

@@ -18,12 +18,7 @@ from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.evidence import posterior_of
 from calib_ros.estimation.fitted import Fitted, Simpler
-from calib_ros.estimation.leastsquares import (
-    System,
-    factor_of,
-    minimise,
-    triangular_factor,
-)
+from calib_ros.estimation.leastsquares import System, factor_of, minimise, triangular_factor
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.noise import Noise, noise_of, squares_of
 from calib_ros.estimation.observations import SOME_POSES

@@ -25,12 +25,7 @@ from calib_ros.estimation.identifiability import (
     independent,
     structurally_independent,
 )
-from calib_ros.estimation.leastsquares import (
-    System,
-    factor_of,
-    minimise,
-    triangular_factor,
-)
+from calib_ros.estimation.leastsquares import System, factor_of, minimise, triangular_factor
 from calib_ros.estimation.levels import TELLING
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.problem import Problem

@@ -75,12 +75,7 @@ class Units:
             self.notes.append(f'no units are given: taking {", ".join(self._assumed)}')
 
     def _in_words(
-        self,
-        what: str,
-        units: Mapping[str, float],
-        usual: str,
-        given: str,
-        columns: Sequence[str],
+        self, what: str, units: Mapping[str, float], usual: str, given: str, columns: Sequence[str]
     ) -> str:
         """Return the one of some units that lines of words tell, or the usual one.
 

@@ -42,11 +42,7 @@ STANDINGS: dict[str, tuple[Headline, tuple[str, ...]]] = {
     ),
     'FAIL': (
         Headline('bad', 'FAIL: the arm exceeds the tolerance'),
-        (
-            SOMETHING_MOVED,
-            ACTIVE,
-            'Calibrate again with new poses; try --model auto.',
-        ),
+        (SOMETHING_MOVED, ACTIVE, 'Calibrate again with new poses; try --model auto.'),
     ),
     'UNDECIDED': (
         Headline('open', 'UNDECIDED: too few measurements to tell'),
@@ -261,10 +257,7 @@ def verification_report(
         remarks=(*warnings, *map(sentence, not_steps(hints(found) + causes(found), steps))),
         identity=sections.identity_of(chain, origin, poses, [different], table_hash(chain)),
         explorer=explorer(chain, poses),
-        sections=(
-            *others,
-            sections.coverage(chain, poses.joints, 'How far each joint was moved'),
-        ),
+        sections=(*others, sections.coverage(chain, poses.joints, 'How far each joint was moved')),
         origin=origin,
     )
 
@@ -289,11 +282,7 @@ def _by_configuration(found: Verification) -> Section:
         text,
         head=('pose', 'cycles', *names[:shown]),
         rows=tuple(
-            (
-                f'P{k}',
-                str(cycles),
-                *('' if x is None else rounded(x) for x in values[:shown]),
-            )
+            (f'P{k}', str(cycles), *('' if x is None else rounded(x) for x in values[:shown]))
             for k, (cycles, *values) in enumerate(found.each, 1)
         ),
     )

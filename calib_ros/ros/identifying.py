@@ -22,14 +22,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.history import History
 from calib_ros.files.loading import Loaded
-from calib_ros.files.rows import (
-    Filing,
-    Row,
-    identified,
-    inputs_of,
-    samples_hash,
-    settings_hash,
-)
+from calib_ros.files.rows import Filing, Row, identified, inputs_of, samples_hash, settings_hash
 from calib_ros.identification.age import measured_at
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain

@@ -91,9 +91,7 @@ def links_of(streams: Iterable[Stream]) -> list[Links]:
     return list(dict.fromkeys(each.links for each in streams if each.links is not None))
 
 
-def batches(
-    messages: Iterator[tuple[Stream, bytes]],
-) -> Iterator[tuple[Batch, Exception | None]]:
+def batches(messages: Iterator[tuple[Stream, bytes]]) -> Iterator[tuple[Batch, Exception | None]]:
     """Yield batches of messages; the last one has the error that ended them, if any."""
     error, ended = None, False
     while not ended:

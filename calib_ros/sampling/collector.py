@@ -21,15 +21,7 @@ from calib_ros.sampling.buffers import Rows, Waiting
 from calib_ros.sampling.hints import Hint, apart, ended, restless, sparse
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.sampler import ROW_WIDTH, TWICE, Found, Numbered, Sampler
-from calib_ros.sampling.slices import (
-    JOINTS,
-    NO_ACCIDENT,
-    POSES,
-    Series,
-    Slice,
-    Stamps,
-    StreamKey,
-)
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Series, Slice, Stamps, StreamKey
 from calib_ros.sampling.stops import SAMPLED, Known, Rests, Schedule, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.settings import Settings

@@ -41,8 +41,7 @@ WHILE_OTHERS = Flaw(
     'while others were processed', f'{MOST_WAITING} others were still processed: stop for longer'
 )
 FORGOTTEN = Flaw(
-    'dropped, memory for images full',
-    'the memory for images was full: send fewer or smaller ones',
+    'dropped, memory for images full', 'the memory for images was full: send fewer or smaller ones'
 )
 
 
