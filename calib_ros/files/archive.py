@@ -71,7 +71,8 @@ class Archive:
         except OSError as err:
             why = f'poses cannot be kept in {folder} ({err.strerror})'
             raise InputError(f'{why}: set data_dir to a writable folder') from err
-        self._path = self._new_path(_JOURNAL)
+        self.path = self._new_path(_JOURNAL)
+        """The journal, begun or not."""
 
     @property
     def trouble(self) -> str:
@@ -82,11 +83,6 @@ class Archive:
     def _unsafe(self) -> bool:
         """Tell whether samples would be lost if the files were closed."""
         return bool(self.error and (self._waiting or self._journal))
-
-    @property
-    def path(self) -> Path:
-        """Return the path of the journal, begun or not."""
-        return self._path
 
     @property
     def journal(self) -> Path | None:
@@ -110,8 +106,8 @@ class Archive:
         """Write waiting rows if possible; a journal that is gone continues in another file."""
         try:
             if self._journal is not None and self._journal.gone:
-                if self._path == self._journal.path:
-                    self._path = self._new_path(_JOURNAL)
+                if self.path == self._journal.path:
+                    self.path = self._new_path(_JOURNAL)
                 self._begin(self._journal.content)
             elif self._journal is None and (self._waiting or self._due):
                 self._begin()
@@ -126,12 +122,12 @@ class Archive:
             self.error = ''
 
     def _begin(self, content: bytes = b'') -> None:
-        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
         beside = joints_line(self._joints) + self._configuration()
-        write_file(settings_beside(self._path), beside, overwrite=True)
+        write_file(settings_beside(self.path), beside, overwrite=True)
         if content:
-            write_file(self._path, content, overwrite=True)
-        before, self._journal = self._journal, Journal(self._path, len(self._joints))
+            write_file(self.path, content, overwrite=True)
+        before, self._journal = self._journal, Journal(self.path, len(self._joints))
         if before is not None:
             before.close()
         self._due = False
@@ -146,7 +142,7 @@ class Archive:
             )
         old = self.journal
         self.close()
-        self._path = self._new_path(_JOURNAL)
+        self.path = self._new_path(_JOURNAL)
         self._due = old is not None
         self.write()
         return old
@@ -156,7 +152,7 @@ class Archive:
         newest = self.newest_journal()
         if newest is None:
             return (), (f'nothing to resume in {self.folder}: a new session begins',)
-        self._path = newest
+        self.path = newest
         refuse_other_joints_than(self._joints, newest)
         try:
             samples, warnings = read_journal(newest, len(self._joints))
@@ -165,7 +161,7 @@ class Archive:
                 f'{err}. It is left untouched: repair it, move it away to continue the one '
                 'before, or start without resume to begin another'
             ) from err
-        self._journal = Journal(self._path, len(self._joints))
+        self._journal = Journal(self.path, len(self._joints))
         return samples, warnings
 
     def newest_journal(self) -> Path | None:
@@ -207,10 +203,10 @@ class Archive:
         if self._unsafe:
             why, before = self.error, self.journal
             with suppress(OSError):
-                self._path = Path(mkdtemp(prefix='calib_ros_')) / self._path.name
+                self.path = Path(mkdtemp(prefix='calib_ros_')) / self.path.name
                 self._begin(b'' if self._journal is None else self._journal.content)
                 self.write()
-            where = f'are in {self._path}, not in {self.folder}'
+            where = f'are in {self.path}, not in {self.folder}'
             if self._unsafe:
                 others = f'other than those in {before} ' if before and before.is_file() else ''
                 where = f'{others}are lost'

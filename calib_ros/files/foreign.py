@@ -167,6 +167,7 @@ class _Table:
         if joints and chain is not None:
             self._complete(chain)
         self._refuse_nominal(named)
+        self._used = {name for each in self._columns.values() for name in each.names}
 
     def _asked(self, asked: Mapping[str, Expression], optional: set[str]) -> dict[str, Expression]:
         """Return the expressions whose columns are there; others must be optional."""
@@ -258,10 +259,6 @@ class _Table:
     def unread(self) -> list[str]:
         """Return the names of the columns that nothing is made of."""
         return [name for k, name in enumerate(self._sheet.header, 1) if f'#{k}' not in self._used]
-
-    @property
-    def _used(self) -> set[str]:
-        return {name for each in self._columns.values() for name in each.names}
 
     def labels(self, other: _Table) -> Iterator[tuple[str, str, list[str]]]:
         """Yield columns that may name the poses of both tables: a kind, the name, and the cells.
