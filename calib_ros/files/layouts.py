@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from calib_ros.annotated import check_fields
 from calib_ros.errors import LONGEST_NAME, MOST_ENTRIES, ConfigError, UnknownNameError
 from calib_ros.files.vocabulary import (
     ANGLES,
@@ -126,12 +127,7 @@ class Layout:
     insisted: tuple[str, ...] = ()  # options given, whose units hold against the header's
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if item.name != 'columns' and type(value) is not type(item.default):
-                raise ConfigError(
-                    f'"{item.name}" of a layout must be a {item.type}, not {value!r}'
-                )
+        check_fields(self)
         known = {'separator': (*SEPARATORS, *SEPARATORS.values()), 'decimal': ('.', ',')}
         known |= {'length': (*LENGTHS,), 'angle': (*ANGLES,), 'joint_angle': (*ANGLES,)}
         for name, values in {**known, 'quaternion': ('xyzw', 'wxyz')}.items():
@@ -149,10 +145,8 @@ class Layout:
             raise ConfigError(f'only one form of rotation is allowed: give {" or ".join(ways)}')
         if self.decimal == ',' and self.cut == ',':
             raise ConfigError('the comma cannot separate both cells and decimals')
-        if not isinstance(self.columns, Mapping) or len(self.columns) > MOST_ENTRIES:
-            raise ConfigError(
-                '"columns" of a layout must map our columns to expressions of theirs'
-            )
+        if len(self.columns) > MOST_ENTRIES:
+            raise ConfigError(f'columns must be at most {MOST_ENTRIES}, not {len(self.columns)}')
         for name in self.columns:
             if name not in (*NUMBERS, *WORDS) and not JOINT.fullmatch(name):
                 raise UnknownNameError('column', name, ('q1', *NUMBERS, *WORDS))
