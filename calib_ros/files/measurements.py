@@ -185,17 +185,17 @@ class Measurements:
         if self.frame_id[1] == ['']:
             return
         kinds, number = distinct_rows(np.column_stack([self.codes[:, :2], self.frame_id[0]]))
-        frames: dict[tuple[int, ...], dict[str, int]] = {}
+        frames: dict[tuple[int, ...], list[str]] = {}
         for k, (*device, frame) in enumerate(kinds.tolist()):
-            if self.frame_id[1][frame]:
-                frames.setdefault(tuple(device), {})[self.frame_id[1][frame]] = k
+            if name := self.frame_id[1][frame]:
+                lines = lines_in_words(self.lines[number == k].tolist())
+                frames.setdefault(tuple(device), []).append(f'{name} ({lines})')
         for names in frames.values():
-            lines = {name: self.lines[number == k].tolist() for name, k in names.items()}
             if len(names) > 1:
-                found = ', '.join(f'{name} ({lines_in_words(lines[name])})' for name in names)
                 raise InputError(
-                    f'{self.path}: poses came in different frames: {found}; only one is allowed: '
-                    'leave out the rows of the others, or give each frame its own device'
+                    f'{self.path}: poses came in different frames: {", ".join(names)}; only one '
+                    'is allowed: leave out the rows of the others, or give each frame its own '
+                    'device'
                 )
 
 
