@@ -115,7 +115,8 @@ def _program(found: Columns, chain: Chain) -> tuple[Columns, tuple[str, ...], Fl
     ways = (names, [*joints], [name.upper() for name in names])
     names = next((each for each in ways if {*needed(each)} <= {*header}), names)
     columns = [_column(found, name) for name in names]
-    units = _units(found, chain, columns)
+    kinds = (ANGLES if joint.type == 'revolute' else LENGTHS for joint in chain.joints)
+    units = _units(found, dict(zip(columns, kinds, strict=True)))
     how = '; values are in rad or m, or in the unit named there: q1 [deg]'
     how += '; of a Fanuc q3 = J3 + J2' * ('J3' in header)
     with_rows(found, needed(columns), how)
@@ -130,22 +131,21 @@ def _program(found: Columns, chain: Chain) -> tuple[Columns, tuple[str, ...], Fl
     return found, tuple(columns), units, Program(tuple(joints[k] for k in given), values)
 
 
-def _units(found: Columns, chain: Chain, columns: Sequence[str]) -> FloatArray:
-    """Return the units (n) [rad or m] of the joints' columns."""
-    units, seen = [], dict[tuple[str, bool], str]()
-    for joint, column in zip(chain.joints, columns, strict=True):
-        unit = name_and_unit(column)[1]
-        known = ANGLES if joint.type == 'revolute' else LENGTHS
-        if unit and unit not in known:
-            raise InputError(f'{found.path}: {column} must be in {" or ".join(known)}')
-        units.append(known.get(unit, 1.0))
-        if column in found.header:
-            seen[joint.type, bool(unit)] = column
-    for (kind, named), column in seen.items():
-        if not named and (kind, True) in seen:
-            other = seen[kind, True]
-            raise InputError(f'{found.path}: {column} has no unit, {other} has: name it in all')
-    return np.array(units)
+def _units(found: Columns, columns: Mapping[str, Mapping[str, float]]) -> FloatArray:
+    """Return the units (n) [rad or m] of columns, named in all of a kind or none.
+
+    `columns` has the units that each may have.
+    """
+    told = {column: name_and_unit(column)[1] for column in columns}
+    for column, known in columns.items():
+        where = f'{found.path}: {column}'
+        if told[column] not in ('', *known):
+            raise InputError(f'{where} must be in {" or ".join(known)}')
+        alike = [c for c in columns if columns[c] is known and c in found.header]
+        named = [c for c in alike if told[c] in known]
+        if named and column in {*alike} - {*named}:
+            raise InputError(f'{where} has no unit, {named[-1]} has: name it in all')
+    return np.array([known.get(told[column], 1.0) for column, known in columns.items()])
 
 
 def read_poses(path: Path) -> FloatArray:
@@ -158,14 +158,7 @@ def read_poses(path: Path) -> FloatArray:
     how = '; lengths are in m, or in the unit named there: x [mm]'
     found = _with_decimals(with_rows(table, columns, how), columns)
     numbers = found.block(columns)
-    told = {column: name_and_unit(column)[1] for column in columns[:3]}
-    for column, unit in told.items():
-        if unit not in (LENGTHS if any(told.values()) else ('',)):
-            raise InputError(
-                f'{path}: {column} names no unit of length ({", ".join(LENGTHS)}): name one in '
-                'each of x, y and z, or in none for m'
-            )
-    numbers[:, :3] *= [LENGTHS.get(unit, 1.0) for unit in told.values()]
+    numbers[:, :3] *= _units(found, dict.fromkeys(columns[:3], LENGTHS))
     check_quaternions(found, numbers[:, 3:])
     return se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
 

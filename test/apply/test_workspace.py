@@ -149,9 +149,12 @@ def test_the_poses_of_a_task_may_have_units(tmp_path):
     path = tmp_path / 'task.csv'
     path.write_text('x [mm];y [mm];z [cm];qx;qy;qz;qw\n100,5;200;30;0;0;0;1\n')
     np.testing.assert_allclose(read_poses(path)[0, :3, 3], [0.1005, 0.2, 0.3])
-    for old, new in (('[cm]', '[deg]'), (' [deg]', '')):
+    for old, new, told in (
+        ('[cm]', '[deg]', r'z .deg. must be in m or cm or mm'),
+        (' [deg]', '', r'z has no unit, y .mm. has: name it in all'),
+    ):
         path.write_text(path.read_text().replace(old, new))
-        with pytest.raises(InputError, match=r'z.* names no unit of length'):
+        with pytest.raises(InputError, match=told):
             read_poses(path)
 
 
