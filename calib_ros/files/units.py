@@ -44,30 +44,22 @@ class Units:
         types = [] if chain is None else [joint.type for joint in chain.joints]
         slides = [name for name in joints if types[int(name[1:]) - 1 :][:1] == ['prismatic']]
         turns = [name for name in joints if name not in slides]
-        main = [name for name in turns if name[0] == 'q']
         given: dict[str, str] = {name: getattr(layout, name) for name in layout.insisted}
-        angle = given.get('angle', '')
-        known = angle or given.get('joint_angle', '')
-        usual = self._in_words(
-            'angles', ANGLES, layout.angle, known, (*turns, *TURNS, *IN_TURN, *SIGMAS[3:])
-        )
-        length = given.get('length', '')
-        lengths = *POSITION, 'distance', *slides, *SIGMAS[:3]
-        found = self._told(
-            'length',
-            length,
-            self._in_words('lengths', LENGTHS, layout.length, length, lengths),
-            (*POSITION, 'distance'),
-            (*slides, *SIGMAS[:3]),
-        )
-        angles = self._told('angle', angle, usual, (*TURNS, *IN_TURN), SIGMAS[3:])
-        said = set() if any(map(self._said, main)) else {*map(self._said, angles)} - {''}
-        found |= angles | self._told(
+        length, angle, own = (given.get(name, '') for name in ('length', 'angle', 'joint_angle'))
+        places, rotations = (*POSITION, 'distance'), (*TURNS, *IN_TURN)
+        lengths, angles = (*slides, *SIGMAS[:3]), (*turns, *rotations, *SIGMAS[3:])
+        usual = self._in_words('angles', ANGLES, layout.angle, angle or own, angles)
+        far = self._in_words('lengths', LENGTHS, layout.length, length, (*places, *lengths))
+        found = self._told('length', length, far, places, lengths)
+        turned = self._told('angle', angle, usual, rotations, SIGMAS[3:])
+        main = [name for name in turns if name[0] == 'q']
+        said = set() if any(map(self._said, main)) else {*map(self._said, turned)} - {''}
+        found |= turned | self._told(
             'joint-angle',
-            given.get('joint_angle', '' if layout.joint_angle else angle),
+            own or ('' if layout.joint_angle else angle),
             layout.joint_angle or usual or (said.pop() if len(said) == 1 else ''),
             main,
-            [n for n in turns if n not in main],
+            [name for name in turns if name not in main],
         )
         self.factors = {name: (LENGTHS | ANGLES)[unit] for name, unit in found.items()}
         """Factors of our columns to m and rad."""
