@@ -31,6 +31,7 @@ from calib_ros.files.journal import (
     read_journal,
     refuse_other_joints_than,
     settings_beside,
+    whole_journal,
 )
 from calib_ros.sampling.sample import Sample
 
@@ -62,6 +63,7 @@ class Archive:
         self._configuration = configuration
         self._journal: Journal | None = None
         self._waiting: list[tuple[Sample, bool]] = []
+        self._written: list[tuple[Sample, bool]] = []  # to the journal that is open
         self._due = False
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -103,17 +105,17 @@ class Archive:
         self.write()
 
     def write(self) -> None:
-        """Write waiting rows if possible; a journal that is gone continues in another file."""
+        """Write waiting rows if possible; a journal that is gone begins anew as another."""
         try:
             if self._journal is not None and self._journal.gone:
                 if self.path == self._journal.path:
                     self.path = self._new_path(_JOURNAL)
-                self._begin(self._journal.content)
+                self._begin()
             elif self._journal is None and (self._waiting or self._due):
                 self._begin()
             while self._journal is not None and self._waiting:
                 self._journal.add(*self._waiting[0])
-                del self._waiting[0]
+                self._written.append(self._waiting.pop(0))
         except OSError as err:
             self.error = trouble(OSError(err.errno, err.strerror))  # without the path: known
         except InputError as err:  # another process writes it
@@ -121,12 +123,13 @@ class Archive:
         else:
             self.error = ''
 
-    def _begin(self, content: bytes = b'') -> None:
+    def _begin(self) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         beside = joints_line(self._joints) + self._configuration()
         write_file(settings_beside(self.path), beside, overwrite=True)
-        if content:
-            write_file(self.path, content, overwrite=True)
+        if self._written:
+            whole = whole_journal(self._written, len(self._joints))
+            write_file(self.path, whole, overwrite=True)
         before, self._journal = self._journal, Journal(self.path, len(self._joints))
         if before is not None:
             before.close()
@@ -162,6 +165,7 @@ class Archive:
                 'before, or start without resume to begin another'
             ) from err
         self._journal = Journal(self.path, len(self._joints))
+        self._written = [(each, False) for each in samples]
         return samples, warnings
 
     def newest_journal(self) -> Path | None:
@@ -204,7 +208,7 @@ class Archive:
             why, before = self.error, self.journal
             with suppress(OSError):
                 self.path = Path(mkdtemp(prefix='calib_ros_')) / self.path.name
-                self._begin(b'' if self._journal is None else self._journal.content)
+                self._begin()
                 self.write()
             where = f'are in {self.path}, not in {self.folder}'
             if self._unsafe:
@@ -213,7 +217,7 @@ class Archive:
             words = f'poses {where}: {why}'
         if self._journal is not None:
             self._journal.close()
-            self._journal = None
+            self._journal, self._written = None, []
         return words
 
     def _new_path(self, ending: str) -> Path:

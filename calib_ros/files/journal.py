@@ -42,30 +42,28 @@ class Journal:
 
     def __init__(self, path: Path, joints: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.path = path
+        self.path, self._size = path, 0
         self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
         with ExitStack() as stack:
             stack.callback(self.close)
             self._lock()
             self._begin(columns(joints))
+            self._size = os.fstat(self._file).st_size
             stack.pop_all()
 
     def add(self, sample: Sample, removed: bool = False) -> None:
         """Append a sample, or its removal."""
-        self._write(cells(sample, 'removed' if removed else None))
+        self._write(_of_sample(sample, removed))
 
     @property
     def gone(self) -> bool:
-        """Tell whether the file was deleted, moved or replaced."""
+        """Tell whether the file was deleted, moved, replaced, cut or written by others."""
         try:
-            return not os.path.samestat(os.stat(self.path), os.fstat(self._file))
+            there = os.stat(self.path)
         except FileNotFoundError:
             return True
-
-    @property
-    def content(self) -> bytes:
-        """Return what was written, wherever the file is now."""
-        return os.pread(self._file, os.fstat(self._file).st_size, 0)
+        same = os.path.samestat(there, os.fstat(self._file))
+        return not same or there.st_size != self._size
 
     def close(self) -> None:
         """Close the file."""
@@ -98,7 +96,7 @@ class Journal:
             )
         if found != expected:
             os.ftruncate(self._file, 0)
-            self._write(header)
+            self._write(_line(header))
             return
         end, size = -1, os.fstat(self._file).st_size
         while end < 0:  # the header ends a line
@@ -110,15 +108,28 @@ class Journal:
         else:
             os.ftruncate(self._file, begin + end + 1)
 
-    def _write(self, row: Sequence[str]) -> None:
-        text = io.StringIO()
-        csv.writer(text).writerow(row)  # its line end makes it quote names with any
-        data = text.getvalue().removesuffix('\r\n').encode() + b'\n'
+    def _write(self, data: bytes) -> None:
         begin = os.fstat(self._file).st_size
         written = os.write(self._file, data)
         if written < len(data):  # the disk is full: no half row may stay
             os.ftruncate(self._file, begin)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self._size += written
+
+
+def whole_journal(rows: Sequence[tuple[Sample, bool]], joints: int) -> bytes:
+    """Return the content of a journal with samples, and their removals (true)."""
+    return b''.join([_line(columns(joints)), *(_of_sample(*row) for row in rows)])
+
+
+def _of_sample(sample: Sample, removed: bool) -> bytes:
+    return _line(cells(sample, 'removed' if removed else None))
+
+
+def _line(row: Sequence[str]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text).writerow(row)  # its line end makes it quote names with any
+    return text.getvalue().removesuffix('\r\n').encode() + b'\n'
 
 
 def settings_beside(path: Path) -> Path:

@@ -90,9 +90,8 @@ class CalibrationNode(Batched):
         robot = f'{chain.name}/{given.serial or self.get_namespace()[1:]}'.rstrip('/')
         named = folder, robot, chain.joint_names
         self._archive = Archive(*named, self._configuration, given.tip_link)
-        self.session = CalibrationSession(
-            chain, given.settings, self._on_sample, self._archive.remove
-        )
+        kept = (partial(self._keep, each) for each in (self._archive.add, self._archive.remove))
+        self.session = CalibrationSession(chain, given.settings, *kept)
         self.session.pictures.cameras = cameras_of(given.settings.sources)
         self._filer, self._status_text = Filer(given.history, given.serial, chain), ''
         self.lost = ''
@@ -226,11 +225,17 @@ class CalibrationNode(Batched):
 
     # The journal
 
-    def _on_sample(self, sample: Sample) -> None:
-        before = self._archive.error
-        self._archive.add(sample)
-        if self._archive.error and not before:
-            self.get_logger().error(f'poses are kept in memory only: {self._archive.error}')
+    def _keep(self, write: Callable[..., None], *samples: Sample) -> None:
+        archive = self._archive
+        error, journal = archive.error, archive.journal
+        write(*samples)
+        if archive.error and not error:
+            self.get_logger().error(f'poses are kept in memory only: {archive.error}')
+        if journal not in (None, archive.journal):
+            self.get_logger().warning(
+                f'{journal} was deleted, moved or changed by another program: all poses of this '
+                f'session continue in {archive.journal}'
+            )
 
     def _resume(self) -> None:
         samples, warnings = self._archive.resume()
@@ -345,7 +350,7 @@ class CalibrationNode(Batched):
         """Do the work of each second; a failing part does not stop the others."""
         tried = self._boundary.tried
         tried('taking messages', self._take_messages)
-        tried('the journal', self._archive.write)
+        tried('the journal', partial(self._keep, self._archive.write))
         status = tried('the status', self._publish_status) or ''
         tried('expected accuracy or next pose', self._guide.advise)
         self._diagnostics.publish(status, self._answers)

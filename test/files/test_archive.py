@@ -339,7 +339,7 @@ def test_a_note_that_cannot_be_written_is_none(tmp_path):
     assert archive.note('text', archive.path) is None
 
 
-@pytest.mark.parametrize('how', ['deleted', 'folder deleted', 'replaced'])
+@pytest.mark.parametrize('how', ['deleted', 'folder deleted', 'replaced', 'cut', 'emptied'])
 def test_a_journal_that_is_not_there_any_more_goes_on_in_another_file(tmp_path, how):
     folder = tmp_path / 'data'
     archive = open_archive(folder)
@@ -355,6 +355,8 @@ def test_a_journal_that_is_not_there_any_more_goes_on_in_another_file(tmp_path, 
     elif how == 'replaced':
         (folder / 'edited').write_text('by an editor')
         (folder / 'edited').replace(first)
+    elif how in ('cut', 'emptied'):  # by an editor that saves in place
+        os.truncate(first, first.stat().st_size - 20 if how == 'cut' else 0)
     else:
         first.unlink()
     archive.add(sample(3))

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real node in a process of its own that is killed, or finds no room."""
 
+import os
 import resource
 import signal
 import threading
@@ -282,6 +283,21 @@ def test_a_full_disk(tmp_path, recording):
         cell.done('save')
         assert child.end(signal.SIGINT) == 0
         assert child.output.count('poses are kept in memory only') == 1
+
+
+def test_a_journal_that_an_editor_saves_meanwhile_begins_anew(tmp_path, recording):
+    """Rows that the editor did not have were lost without a word."""
+    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
+        told = cell.log()
+        cell.play(part(recording, 0.0, 6.0))
+        (path,) = tmp_path.glob('*Z.csv')
+        os.truncate(path, path.stat().st_size // 2)
+        warned = f'{path} was deleted, moved or changed by another program: all poses of this'
+        cell.spin_until(lambda: any(warned in each.msg for each in told))
+        stamps = [each.stamp_ns for each in cell.node.session.samples]
+        samples, _ = read_journal(cell.node._archive.journal, 6)
+        assert stamps
+        assert [each.stamp_ns for each in samples] == stamps
 
 
 def test_a_closed_node_does_not_end_its_executor(tmp_path):
