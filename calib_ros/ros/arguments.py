@@ -195,25 +195,48 @@ def typed(command: Sequence[str]) -> list[str]:
 
 def refuse_ignored_files(command: Sequence[str], node: str) -> None:
     """Refuse parameter files with no key for a node, by its full name: ROS ignores them."""
-    import yaml
-
-    def nodes(content: Mapping[str, Any], above: str) -> Iterator[str]:
-        for key, below in content.items():
-            name = f'{above}/{key.strip("/")}'
-            yield from nodes(below, name) if 'ros__parameters' not in below else (name,)
 
     def applies(key: str) -> bool:  # * is one name, /** any number of them
         names = re.escape(key).replace(r'/\*\*', r'(/\w+)*').replace(r'\*', r'\w+')
         return bool(re.fullmatch(names, node))
 
-    paths = [path for flag, path in pairwise(command) if flag == '--params-file']
-    found = (yaml.safe_load(Path(path).read_bytes()) or {} for path in paths)
-    keys = [key for each in found for key in nodes(each, '')]
+    paths, keys = _files(command), [key for key, _ in _sections(command)]
     if keys and not any(map(applies, keys)):
         raise ConfigError(
             f'{" and ".join(paths)} has no parameters of {node}, but of {", ".join(some(keys))}: '
             'use the key /**, which matches every node'
         )
+
+
+def shared_names(command: Sequence[str]) -> set[str]:
+    """Return the parameters that files give to all nodes, if they name some node besides."""
+    found = [('*' in key.rpartition('/')[2], names) for key, names in _sections(command)]
+    if all(wild for wild, _ in found):
+        return set()
+    return {name for wild, names in found if wild for name in names}
+
+
+def _files(command: Sequence[str]) -> list[str]:
+    return [path for flag, path in pairwise(command) if flag == '--params-file']
+
+
+def _sections(command: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Return the keys in parameter files, and the names of the parameters under each."""
+    import yaml
+
+    def leaves(content: Mapping[str, Any], above: str) -> Iterator[str]:
+        for key, below in content.items():
+            name = f'{above}{key}'
+            yield from leaves(below, f'{name}.') if isinstance(below, dict) else (name,)
+
+    def nodes(content: Mapping[str, Any], above: str) -> Iterator[tuple[str, list[str]]]:
+        for key, below in content.items():
+            name, given = f'{above}/{key.strip("/")}', below.get('ros__parameters', below)
+            own = [] if given is below else [(name, [*leaves(given or {}, '')])]
+            yield from own or nodes(below, name)
+
+    found = (yaml.safe_load(Path(path).read_bytes()) or {} for path in _files(command))
+    return [each for content in found for each in nodes(content, '')]
 
 
 def refuse_unknown(command: Sequence[str], launch_file: str, known: Sequence[str]) -> None:

@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from operator import itemgetter
@@ -30,7 +30,7 @@ from rclpy.waitable import NumberOfEntities, Waitable
 from std_srvs.srv import Trigger
 
 from calib_ros.errors import CalibrationError, trouble
-from calib_ros.ros.arguments import NODE, refuse_ignored_files, typed, usage
+from calib_ros.ros.arguments import NODE, refuse_ignored_files, shared_names, typed, usage
 
 Answer = tuple[bool, str]
 
@@ -223,8 +223,8 @@ class DeferredTrigger:
             return
 
 
-def run_node(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
-    """Run a node until SIGINT or SIGTERM; return the exit status.
+def run_node(make: Callable[[Collection[str]], Any], arguments: Sequence[str] | None) -> int:
+    """Run a node, made with `shared_names`, until SIGINT or SIGTERM; return the exit status.
 
     rclpy must not see the signals: its handler invalidates the context while messages are taken.
     """
@@ -248,7 +248,7 @@ def run_node(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
     status, finished = 0, True
     try:
         rclpy.init(args=command, signal_handler_options=SignalHandlerOptions.NO)
-        node = make()
+        node = make(shared_names(command))
         refuse_ignored_files(command, node.get_fully_qualified_name())
         executor = SingleThreadedExecutor()
         executor.add_node(node)

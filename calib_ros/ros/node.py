@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -70,7 +70,7 @@ STATUS_LENGTH = 120  # characters of the status: `ros2 topic echo` cuts texts at
 class CalibrationNode(Batched):
     """Calibrates one robot from its joint states and measurements."""
 
-    def __init__(self, **node_options: Any) -> None:
+    def __init__(self, shared: Collection[str] = (), **node_options: Any) -> None:
         try:
             super().__init__(
                 'calibration_node',
@@ -81,7 +81,7 @@ class CalibrationNode(Batched):
             raise ConfigError(
                 f"a parameter file has an empty list []: write [''] or leave it out ({err})"
             ) from err
-        given, names = declare_all(self)
+        given, names = declare_all(self, shared)
         home = os.environ.get('ROS_HOME', '~/.ros')
         chain, urdf = load_robot(self, given)
         self._given = given

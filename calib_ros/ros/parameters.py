@@ -9,7 +9,7 @@ Every field of `Settings` is a parameter of the same name, with its description 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,13 +21,14 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import String
 
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import ConfigError, UnknownNameError, near
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, chain_text, load_chain
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.ros.arguments import PARAMETERS, NodeParameter
 from calib_ros.sampling.slices import SILENCE
 from calib_ros.settings import Settings
+from calib_ros.shown import some
 from calib_ros.values import LARGEST_SETTING, parse_like
 
 QOS = 'qos_overrides.'
@@ -47,11 +48,12 @@ class Given(SimpleNamespace):
         return {'base_link': self.base_link or None, 'tip_link': self.tip_link or None}
 
 
-def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
+def declare_all(node: Node, shared: Collection[str]) -> tuple[Given, Sequence[str]]:
     """Declare all parameters of the node; return their values, and the names that were set.
 
     The node declares whatever is set, because rclpy lists it in no other way. Each parameter is
-    declared again here with its description. Impossible values raise ConfigError.
+    declared again here with its description. Impossible values raise ConfigError, and unknown
+    names that are not `shared` by all nodes.
     """
     given = node.get_parameters_by_prefix('').items()
     overrides = {name: each.value for name, each in given if not name.startswith(OF_ROS)}
@@ -59,6 +61,11 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
         node.undeclare_parameter(name)
     ours = (each for each in PARAMETERS.values() if each.name not in OF_ROS)
     own = {each.name: _declare(node, overrides, each) for each in ours}
+    strange = [each for each in overrides if each in shared and not _is_ours(each)]
+    if strange:
+        told = f'parameters of all nodes that this one does not have: {", ".join(some(strange))}'
+        node.get_logger().warning(f'{told}: they are ignored')
+        overrides = {name: each for name, each in overrides.items() if name not in strange}
     settings = Settings(**{each.name: own[each.name] for each in fields(Settings)})
     refuse_unknown_names(node, [*overrides], QOS)
     if not own['chain']:
@@ -72,6 +79,11 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
             'flange measures; name it, or leave it out'
         )
     return Given(**own, settings=settings), [*overrides]
+
+
+def _is_ours(name: str) -> bool:
+    """Tell whether a parameter is one of the node's, or looks like one with an error."""
+    return name.startswith(QOS) or name in PARAMETERS or bool(near(name, PARAMETERS, 0.8))
 
 
 def changed(settings: Settings, changes: Sequence[Any]) -> Settings:

@@ -260,6 +260,32 @@ def test_a_parameter_file_without_effect_ends_it(tmp_path, capsys, ended_by, nod
     assert said in line
 
 
+@pytest.mark.parametrize(
+    ('own', 'also', 'name', 'ends'),
+    [
+        ('/**', 'tracker', 'robot_ip', False),
+        ('/**/calibration_node', '/**', 'diagnostic_updater.period', False),
+        ('/**', 'tracker', 'sigma_postion', True),  # misspelt
+        ('/**', '/**', 'robot_ip', True),  # a file for this node alone
+        ('calibration_node', '/**', 'qos_overrides./joint_state.subscription.depth', True),
+    ],
+)
+def test_a_parameter_of_all_nodes_is_refused_if_it_may_be_ours(tmp_path, own, also, name, ends):
+    """One file for all nodes of a cell with what they share kept this one from starting."""
+    path, sections = tmp_path / 'cell.yaml', {also: {'port': 1}, '/**': {}}
+    sections[own] = {'chain': 'ur10e', 'data_dir': str(tmp_path)}
+    sections['/**'][name] = 4
+    sections = {key: {'ros__parameters': given} for key, given in sections.items()}
+    path.write_text(yaml.safe_dump(sections))
+    with Child('--params-file', str(path)) as child:
+        if ends:
+            assert child.end() == 1
+            assert f'unknown parameter "{name}"' in child.output
+        else:
+            said = child.wait_for('ready to calibrate ur10e')
+            assert f'that this one does not have: {name}: they are ignored' in said
+
+
 def test_the_parameter_file_applies_under_a_namespace(tmp_path):
     with open(SHIPPED) as file:
         text = file.read().replace("chain: ''", 'chain: meca500')
