@@ -292,17 +292,18 @@ class CalibrationNode(Batched):
         count, why = self.session.capture(socket)
         if not count:
             return False, f'no pose taken: {why}'
+        number = f'{self._archive.trouble}pose {len(self.session.samples)}'
         if socket:
-            return True, f'pose {len(self.session.samples)} taken: ball in socket {socket}'
+            return True, f'{number} taken: ball in socket {socket}'
         taken = self.session.samples[-count:]
         words = ', '.join(
             f'{each.count} measurements, spread {1e3 * each.spread:.3f} mm' for each in taken
         )
-        return True, f'pose {len(self.session.samples)} taken ({words})'
+        return True, f'{number} taken ({words})'
 
     def _on_remove_last(self, request: Any) -> Answer:
         self.session.remove_last()
-        return True, f'pose {len(self.session.samples) + 1} removed'
+        return True, f'{self._archive.trouble}pose {len(self.session.samples) + 1} removed'
 
     def _to_judge(self) -> tuple[Calibration, list[Observations], Callable[..., str]]:
         session = self.session

@@ -285,6 +285,20 @@ def test_a_full_disk(tmp_path, recording):
         assert child.output.count('poses are kept in memory only') == 1
 
 
+def test_an_answer_says_that_a_pose_is_in_memory_only(tmp_path, recording):
+    """*pose 1 taken* was all that who called heard of it."""
+    joints, poses = topics(recording).values()
+    folder = tmp_path / 'data'
+    with Cell(chain='ur10e', data_dir=str(folder), mode='triggered') as cell:
+        cell.play({'joint_states': joints[:28], 'measured_pose': poses[:4]})
+        folder.rmdir()
+        folder.write_text('in the way')
+        answer = cell.done('capture').message
+        assert answer.startswith('poses are in memory only: ')
+        assert '; pose 1 taken' in answer
+        folder.unlink()
+
+
 def test_a_journal_that_an_editor_saves_meanwhile_begins_anew(tmp_path, recording):
     """Rows that the editor did not have were lost without a word."""
     with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
