@@ -91,6 +91,11 @@ class Archive:
         """Return the path of the journal, if any."""
         return None if self._journal is None else self._journal.path
 
+    def begin(self) -> Path | None:
+        """Show that a session begins, so that the journal before, returned, is not resumed."""
+        self.path.touch()
+        return self.newest_journal()
+
     def add(self, sample: Sample) -> None:
         """Keep a sample."""
         self._waiting.append((sample, False))
@@ -144,10 +149,11 @@ class Archive:
                 'the node again with another data_dir'
             )
         old = self.journal
-        self.close()
-        self.path = self._new_path(_JOURNAL)
-        self._due = old is not None
-        self.write()
+        if old is not None:
+            self.close()
+            self.path = self._new_path(_JOURNAL)
+            self._due = True
+            self.write()
         return old
 
     def resume(self) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
@@ -155,6 +161,11 @@ class Archive:
         newest = self.newest_journal()
         if newest is None:
             return (), (f'nothing to resume in {self.folder}: a new session begins',)
+        last = self._files(_JOURNAL, 0)[-1]
+        if last != newest:
+            self.path = last
+            told = f'the last session had no poses: to continue {newest} instead, delete {last}'
+            return (), (told,)
         self.path = newest
         refuse_other_joints_than(self._joints, newest)
         try:
@@ -218,6 +229,9 @@ class Archive:
         if self._journal is not None:
             self._journal.close()
             self._journal, self._written = None, []
+        elif not words and self.path in self._files(_JOURNAL, 0):  # as `begin` made it
+            with suppress(OSError):
+                self.path.unlink()
         return words
 
     def _new_path(self, ending: str) -> Path:
@@ -232,15 +246,15 @@ class Archive:
         found = ((name.fullmatch(path.name), path) for path in self.folder.glob('*'))
         return [(match[1] + match[2], match[3], path) for match, path in found if match]
 
-    def _files(self, ending: str) -> list[Path]:
+    def _files(self, ending: str, least: int = 1) -> list[Path]:
         found = (path for _, ends, path in sorted(self._dated()) if ends == ending)
-        return [path for path in found if _holds_any(path)]
+        return [path for path in found if _holds(path, least)]
 
 
-def _holds_any(path: Path) -> bool:
-    """Tell whether a path is a file that is not empty; a link to a lost one may be."""
+def _holds(path: Path, least: int) -> bool:
+    """Tell whether a path is a file of so many bytes; a link to a lost one may be."""
     try:
         found = path.stat()
     except OSError:
         return True
-    return stat.S_ISREG(found.st_mode) and found.st_size > 0
+    return stat.S_ISREG(found.st_mode) and found.st_size >= least

@@ -98,7 +98,7 @@ class CalibrationNode(Batched):
         """Samples not kept in data_dir at the end, and why; empty if all were."""
         if given.resume:
             self._resume()
-        elif earlier := self._archive.newest_journal():
+        elif earlier := self._archive.begin():
             words = f'a new session begins: to continue {earlier}, start with resume:=true'
             self.get_logger().info(words)
         self._inputs = Inputs(self, self._streams())

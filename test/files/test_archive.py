@@ -166,6 +166,26 @@ def test_nothing_to_resume(tmp_path):
     assert 'nothing to resume' in warning
 
 
+def test_a_session_without_poses_that_was_killed_is_resumed_and_not_the_one_before(tmp_path):
+    """The poses of yesterday became those of a node that respawned before its first one."""
+    written(tmp_path, 1)
+    open_archive(tmp_path).begin()
+    (journal, mark) = sorted(tmp_path.glob('*.csv'))
+    for how in ('killed', 'ended'):
+        again = open_archive(tmp_path)
+        samples, (warning,) = again.resume()
+        assert samples == ()
+        assert warning.endswith(f'to continue {journal} instead, delete {mark}')
+        assert again.start_new() is None
+        if how == 'ended':
+            again.close()
+    assert stamps(tmp_path) == [1]  # nothing was killed
+    again = open_archive(tmp_path)
+    again.begin()
+    again.add(sample(2))
+    assert stamps(tmp_path) == [2]
+
+
 def test_a_journal_from_which_all_was_taken_back_is_resumed(tmp_path):
     archive, only = open_archive(tmp_path), sample(1)
     archive.add(only)

@@ -4,6 +4,7 @@
 
 import os
 import resource
+import shutil
 import signal
 import threading
 from contextlib import contextmanager
@@ -125,6 +126,10 @@ def test_a_session_that_could_go_on_is_told_of(journal):
         said = f'to continue {path}, start with resume:=true'
         cell.spin_until(lambda: any(said in each.msg for each in told))
         assert node.session.samples == []
+        again = cell.start(chain='ur10e', data_dir=str(journal), resume=True)  # as if killed
+        said = f'the last session had no poses: to continue {path} instead, delete {journal}'
+        cell.spin_until(lambda: any(said in each.msg for each in told))
+        assert again.session.samples == []
 
 
 SLOW_IDENTIFICATION = """
@@ -291,7 +296,7 @@ def test_an_answer_says_that_a_pose_is_in_memory_only(tmp_path, recording):
     folder = tmp_path / 'data'
     with Cell(chain='ur10e', data_dir=str(folder), mode='triggered') as cell:
         cell.play({'joint_states': joints[:28], 'measured_pose': poses[:4]})
-        folder.rmdir()
+        shutil.rmtree(folder)
         folder.write_text('in the way')
         answer = cell.done('capture').message
         assert answer.startswith('poses are in memory only: ')
