@@ -243,9 +243,11 @@ def _narrow(text: str, separator: str) -> str:
 
 
 def decimal_sign(cells: Iterable[str]) -> str:
-    """Return the decimal sign in cells of numbers."""
-    commas = any(DECIMAL_COMMA.fullmatch(c) and not THOUSANDS.fullmatch(c) for c in cells)
-    return ',' if commas else '.'
+    """Return the decimal sign in cells of numbers; 1,554 has one where all have such a comma."""
+    numbers = [cell for cell in cells if _is_number(cell, ',')]
+    decimals = [cell for cell in numbers if DECIMAL_COMMA.fullmatch(cell)]
+    clear = len(decimals) == len(numbers) or not all(map(THOUSANDS.fullmatch, decimals))
+    return ',' if decimals and clear else '.'
 
 
 def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, layout_of
+from calib_ros.files.programs import read_joints
 from calib_ros.files.vocabulary import MATRIX, SEPARATORS
 from calib_ros.kinematics.chain import Joint
 
@@ -164,6 +165,19 @@ def test_points_between_thousands_are_no_decimals(tmp_path):
         read_table(path, 2, foreign=Foreign(Layout()))
     (found,) = read_table(path, 2, foreign=Foreign(Layout(decimal=','))).fitted
     np.testing.assert_allclose(found.joints, [[1.554, 2.125]])
+
+
+def test_joint_values_that_all_have_three_decimals_after_a_comma_are_read(tmp_path):
+    """As KUKA and German spreadsheets write them; no option was heard for such a log."""
+    path, log = tmp_path / 'cell.csv', tmp_path / 'log.csv'
+    path.write_text('pose,x,y,z\np1,0.5,1,2\np2,0.25,1,2\n')
+    log.write_text('pose;q1 [deg];q2 [deg]\np1;-94,962;12,500\np2;1,554;2,125\n')
+    (found,) = read_table(path, 2, foreign=Foreign(Layout(), log=log)).fitted
+    np.testing.assert_allclose(np.degrees(found.joints), [[-94.962, 12.5], [1.554, 2.125]])
+    np.testing.assert_allclose(read_joints(log, ARM), found.joints)
+    log.write_text(log.read_text().replace('12,500', '12'))  # 94,962 may be thousands
+    with pytest.raises(InputError, match='give --decimal comma'):
+        read_table(path, 2, foreign=Foreign(Layout(), log=log))
 
 
 def test_stamps_in_seconds_are_told_what_to_give(tmp_path):
