@@ -264,17 +264,19 @@ class _Table:
         """Yield columns that may name the poses of both tables: a kind, the name, and the cells.
 
         Numbers name them under one name, their kind. Capitals, leading zeros and the signs in
-        names may differ: P[1], p_01.
+        names may differ: P[1], p_01. A::T::p1 of SpatialAnalyzer may be p1, too.
         """
         theirs = {name.lower() for name in other._sheet.header}
         for k, name in enumerate(self._sheet.header, start=1):
             number = math.isfinite(self._first(f'#{k}'))
             if name and (not number or name.lower() in theirs):
                 cells = self._sheet.columns.texts(f'#{k}')
-                bare = [LEADING_ZEROS.sub('', cell.lower()).removesuffix('.0') for cell in cells]
-                if not number:
-                    bare = ['.'.join(PARTS.findall(cell)) or cell for cell in bare]
-                yield name.lower() if number else '', name, bare
+                last = [cell.rpartition('::')[2] for cell in cells]
+                for form in (cells, last)[: 1 + (last != cells)]:
+                    bare = [LEADING_ZEROS.sub('', c.lower()).removesuffix('.0') for c in form]
+                    if not number:
+                        bare = ['.'.join(PARTS.findall(cell)) or cell for cell in bare]
+                    yield name.lower() if number else '', name, bare
 
     def numbered(self) -> Iterator[tuple[str, list[str]]]:
         """Yield columns of names with a number, or of numbers that count, and these numbers.

@@ -17,7 +17,7 @@ from calib_ros.files.names import (
     like_joints,
     matrix_in,
     named_in,
-    only_numbers,
+    numbers_in,
     option,
     positions_in,
     quaternions_in,
@@ -118,8 +118,8 @@ def named_by_option(
             f'Several columns are called {", ".join(several)}: rename all but one, or give each '
             f'by its number: --columns {several[0]}={first} (or {", ".join(again)})'
         )
-    if only_numbers(header):
-        given = option(missing, [f'#{k}' for k in range(1, len(missing) + 1)])
+    if len(numbers := numbers_in(header)) >= len(missing):
+        given = option(missing, numbers[: len(missing)])
         return f'Its first line holds numbers, not names: {given}, in its order'
     names = joint_columns(joints)
     lacking = [name for name in names if name in missing]

@@ -217,9 +217,12 @@ def named_in(header: Sequence[str], joint: str) -> str:
     return (same or longer * (len(longer) == 1) or [''])[0]
 
 
-def only_numbers(header: Sequence[str]) -> bool:
-    """Tell whether a header consists of numbers."""
-    return bool(header) and all(re.fullmatch(r'-?[\d.]+(e[+-]?\d+)?', name) for name in header)
+def numbers_in(header: Sequence[str]) -> list[str]:
+    """Return the numbers `#k` of columns that a header calls by values, as a row without one."""
+    whole = [k for k, name in enumerate(header, 1) if re.fullmatch(r'-?[\d.,]+(e[+-]?\d+)?', name)]
+    values = [k for k in whole if re.search('[.,]', header[k - 1])]  # 1 to 6 may name joints
+    of_row = len(whole) == len(header) or len(values) > 1
+    return [f'#{k}' for k in whole] * of_row
 
 
 def _no_joint(name: str) -> bool:
@@ -238,8 +241,9 @@ def _rank(name: str) -> int:
 
 def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:
     """Return the names in a header that count the joints, with a star for the number from 1."""
-    if only_numbers(header):
-        return {'q*': '#*'}
+    if len(numbers := numbers_in(header)) >= max(joints, 1):
+        whole = len(numbers) == len(header)
+        return {'q*': '#*'} if whole else dict(zip(joint_columns(joints), numbers, strict=False))
     names = [name for name in header if not _no_joint(name)]
     for name, first in product(
         sorted(names, key=lambda each: (_rank(each), len(words_of(each)))), (1, 0)

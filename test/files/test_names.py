@@ -27,6 +27,24 @@ def read(path, **given):
     return loading.table(path, ARM, Settings(), foreign=Foreign(layout_of(**given), ARM))
 
 
+def test_columns_of_a_table_without_a_header_are_proposed_by_their_numbers(tmp_path):
+    """Beside the names of its poses, as trackers and controllers export; it was x=NAME."""
+    path, log = tmp_path / 'points.txt', tmp_path / 'log.txt'
+    lines = text_of(PLACES, names='xyz').split()[1:]
+    path.write_text(''.join(f'A::T::p{k}, {line}\n' for k, line in enumerate(lines)))
+    log.write_text(''.join(f'p{k}\t{a}\t{b}\n' for k, (a, b) in enumerate(JOINTS.tolist())))
+    layouts = [layout_of('', ['q1=#2,q2=#3'], {}), layout_of('', ['x=#2,y=#3,z=#4'], {})]
+    for ours, theirs, said in (
+        (layouts[1], Layout(), 'give --columns "q1=#2,q2=#3" or --joints-preset'),
+        (Layout(), layouts[0], 'numbers, not names: --columns "x=#2,y=#3,z=#4", in its order'),
+    ):
+        with pytest.raises(InputError, match=said):
+            read_table(path, 2, foreign=Foreign(ours, ARM, log, theirs))
+    log.write_text(''.join(sorted(log.read_text().splitlines(True), reverse=True)))
+    table = read_table(path, 2, foreign=Foreign(layouts[1], ARM, log, layouts[0]))
+    np.testing.assert_array_equal(table.fitted[0].joints, JOINTS)
+
+
 def names(form):
     return [form.format(axis) for axis in 'XYZ']
 
