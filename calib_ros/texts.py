@@ -105,10 +105,10 @@ def dump_json(value: Any, indent: str = '') -> str:
     return f'{first}\n{indent}  ' + f',\n{indent}  '.join(lines) + f'\n{indent}{last}'
 
 
-def csv_text(rows: Iterable[Iterable[object]], separator: str = ',') -> str:
-    """Return rows as the text of a table."""
+def csv_text(rows: Iterable[Iterable[object]], separator: str = ',', end: str = '\n') -> str:
+    """Return rows as the text of a table, each with that end."""
     text = io.StringIO(newline='')
-    csv.writer(text, delimiter=separator, lineterminator='\n').writerows(rows)
+    csv.writer(text, delimiter=separator, lineterminator=end).writerows(rows)
     return text.getvalue()
 
 

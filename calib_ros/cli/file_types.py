@@ -36,7 +36,7 @@ FILE_KINDS = {
     'program': ('a JointTrajectory', 'use compensate'),
     'native': (
         "a program in a robot's own language",
-        'write its joint values [rad, m] as a CSV with q1 ... qn, a row for each pose',
+        'write its joint values as a CSV of q1 [deg] ... (q1 ... in rad), a row for each pose',
     ),
     'chain': ('a YAML file', 'give an arm as --chain, a calibration as --calibration'),
     'urdf': ('a URDF', 'give it as --chain'),

@@ -234,7 +234,7 @@ def _read_csv(path: Path, chain: Chain) -> ProgramFile:
         for row, values in zip(rows, (corrected.positions / units[given]).tolist(), strict=True):
             for k, value in zip(at, values, strict=True):
                 row[k] = repr(value).replace('.', found.decimal)
-        return csv_text([header, *rows], separator)
+        return csv_text([header, *rows], separator, '\r\n' if '\r\n' in text else '\n')
 
     return ProgramFile(program, tuple(f'line {line}' for line in found.lines), text_with)
 

@@ -214,6 +214,8 @@ def test_a_program_keeps_its_separators_and_decimal_commas(tmp_path, coding):
     np.testing.assert_array_equal(source.program.positions, [[0.25, 1e-5], [-1.5, 2.0]])
     np.testing.assert_array_equal(read_joints(path, arm), source.program.positions)
     assert source.text_with(source.program) == given
+    path.write_text(lines := given.replace('\n', '\r\n'), encoding=coding, newline='')
+    assert read_program(path, arm).text_with(source.program) == lines
     path.write_text(given.replace('2,0', '1.234'), encoding=coding)
     with pytest.raises(InputError, match=r'line 3: q2 .* without the marks between thousands'):
         read_program(path, arm)
