@@ -389,8 +389,8 @@ def _meant(
     lost = np.flatnonzero(far > Compensator.largest_turn)
     if lost.size:
         raise InputError(
-            f'measurement {lost[0] + 1} was taken {far[lost[0]]:.3g} rad or m from '
-            'the nearest commanded joint values: does it belong to that program?'
+            f'measurement {lost[0] + 1} was taken {far[lost[0]]:.3g} rad or m from the nearest '
+            'commanded joint values: is it of that program, with no joint a full turn away?'
         )
     change = Compensator(nominal, calibrated).follower.solve(commanded).change
     both = np.concatenate([commanded, commanded + change])

@@ -32,15 +32,21 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
 from calib_ros.values import parse_numbers
 
+TRAJECTORIES = ('.yaml', '.yml')
 RATES = ('positions', 'velocities', 'accelerations')
 """Fields of a JointTrajectory point that a correction changes."""
 
 
 def read_joints(path: Path, chain: Chain) -> FloatArray:
-    """Read joint values (N, n) [rad or m] from a CSV; refuse any 1e-3 beyond its limits.
+    """Read joint values (N, n) [rad or m] from a CSV or trajectory; refuse any 1e-3 beyond limits.
 
     Columns of held joints may be missing.
     """
+    if path.suffix.lower() in TRAJECTORIES:
+        told = read_program(path, chain)
+        values, _ = joint_values(chain, told.program)
+        check_limits(values, chain, lambda k, _: f'{path}, {told.places[k]}: ')
+        return values
     found, names, _, program = _program(_columns(path)[0], chain)
     values, _ = joint_values(chain, program)
 
@@ -209,7 +215,7 @@ def read_program(path: Path, chain: Chain) -> ProgramFile:
     suffix = path.suffix.lower()
     if suffix == '.csv':
         return _read_csv(path, chain)
-    if suffix in ('.yaml', '.yml'):
+    if suffix in TRAJECTORIES:
         return _read_yaml(read_text(path, LARGEST_TEXT, InputError), str(path))
     raise InputError(f'{path} must be a table (.csv with q1 ... qn) or a JointTrajectory (.yaml)')
 

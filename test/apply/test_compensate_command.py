@@ -237,6 +237,20 @@ def test_units_are_those_of_the_header(tmp_path):
     np.testing.assert_allclose(np.array(written[1:], float), [[270, 1250, 1], [135, 1000.5, 2]])
 
 
+def test_a_trajectory_may_be_the_program_or_the_candidates(tmp_path):
+    """Of verify --commanded, plan --candidates and others; only compensate read one."""
+    path = tmp_path / 'path.yaml'
+    path.write_text(
+        'joint_names: [b, a]\npoints:\n- {positions: [0.5, 0.25]}\n- {positions: [1, 2]}'
+    )
+    joints = (Joint('a', lower=-2.0, upper=2.0), Joint('b', lower=-1.0, upper=1.0))
+    arm = Chain('arm', 'standard', joints)
+    np.testing.assert_array_equal(read_joints(path, arm), [[0.25, 0.5], [2.0, 1.0]])
+    path.write_text(path.read_text().replace('[1, 2]', '[1, 2.5]'))
+    with pytest.raises(InputError, match=r'path.yaml, point 2: 2.5 is beyond the limits of a, '):
+        read_joints(path, arm)
+
+
 def test_line_breaks_in_names_of_columns_are_blanks(tmp_path):
     """As spreadsheets write a unit below a name; the column was not found."""
     path = tmp_path / 'program.csv'
