@@ -89,7 +89,7 @@ def _export(options: argparse.Namespace, screen: Screen) -> int:
         urdf = chain_text(options.urdf)
         name = f'{options.urdf.stem}{CORRECTED_URDF}'
         found = (*found, urdf_export(name, urdf, chain, links))
-    elif Path(options.chain).suffix in URDF_SUFFIXES:
+    elif Path(options.chain).suffix.lower() in URDF_SUFFIXES:
         urdf = chain_text(Path(options.chain))
     found += vendor_files(chain, nominal, origin, urdf, links, options.ur_hash)
     if options.ur_hash and all(each.name != UR.file for each in found):

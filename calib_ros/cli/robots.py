@@ -33,7 +33,7 @@ def _chain(options: argparse.Namespace, screen: Screen) -> int:
     names = ('base_link', 'tip_link', 'convention')
     given = {name: getattr(options, name) for name in names if getattr(options, name)}
     path = Path(options.robot)
-    if path.suffix in chain_file.URDF_SUFFIXES:
+    if path.suffix.lower() in chain_file.URDF_SUFFIXES:
         chain = chain_file.read_urdf(path, **given)
         frames = chain_file.chain_document(chain)
         text = chain_file.dump_chain(replace(chain, base=None, tool=None))

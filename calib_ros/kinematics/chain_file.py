@@ -61,7 +61,7 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
     its target.
     """
     path = Path(name_or_path)
-    if path.suffix in URDF_SUFFIXES:
+    if path.suffix.lower() in URDF_SUFFIXES:
         return replace(read_urdf(path), base=None, tool=None)
     if not path.suffix and not path.is_file():
         robots = shipped_robots()

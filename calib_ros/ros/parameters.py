@@ -117,7 +117,7 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
             came = f'no robot_description arrived within {DESCRIPTION_WAIT:g} s'
             raise ConfigError(f'{came}: start robot_state_publisher, or set chain to a file')
         text = message.data
-    elif Path(name).suffix in URDF_SUFFIXES:
+    elif Path(name).suffix.lower() in URDF_SUFFIXES:
         text = chain_text(Path(name))
     elif any(links.values()):
         raise ConfigError('base_link and tip_link apply only to a URDF')

@@ -330,7 +330,7 @@ def test_a_wrong_link_names_the_right_ones():
 
 
 def test_a_urdf_is_a_chain_file_whose_frames_are_unknown(tmp_path):
-    path = tmp_path / 'arm.urdf'
+    path = tmp_path / 'arm.URDF'
     path.write_text(UR10E)
     chain, whole = load_chain(path), chain_from_urdf(UR10E)
     assert chain.joints == whole.joints
@@ -345,7 +345,7 @@ def test_a_urdf_is_a_chain_file_whose_frames_are_unknown(tmp_path):
 
 
 def test_chain_command(tmp_path, capsys):
-    path = tmp_path / 'panda.urdf'
+    path = tmp_path / 'panda.URDF'
     path.write_text(PANDA)
     links = ['--base-link', 'panda_link0', '--tip-link', 'panda_hand']
     assert main(['chain', str(path), *links, '--convention', 'modified']) == 0
