@@ -57,6 +57,7 @@ CORRECTED_URDF = '_corrected.urdf'  # suffix of a corrected URDF beside these fi
 TAIL = ('a', 'alpha', 'beta', 'b')
 """End of a joint's row in one convention, start of the next joint's in the other."""
 ROW = ('joint', 'type', 'sign')
+RANDOM = ' at 1,000 random poses'
 
 
 class ExportError(CalibrationError):
@@ -71,7 +72,7 @@ class Export:
     content: str
     error: float  # largest position error [m]
     beyond: str = ''  # poses before and after the rows, as text
-    elsewhere: str = ''  # where that is, and the error over the joint range, as text
+    elsewhere: str = RANDOM  # where that is, and the error at other poses, as text
 
 
 def exports(
@@ -116,10 +117,10 @@ def exports(
         ('joint_offsets.csv', ('zero',), 'nominal table with corrected joint offsets only'),
     ):
         best = _approximated(chain, nominal, kinds, region)
-        error, elsewhere = distance(best, chain, region), ''
+        error, elsewhere = distance(best, chain, region), RANDOM
         if joints is not None:
             most = 1e3 * distance(best, chain, q)
-            elsewhere = f' at the measured joint values, {most:.3f} mm over the joint range'
+            elsewhere = f' at the measured joint values, {most:.3f} mm{RANDOM}'
         text = head(chain, f'{nominal.convention} {what}{of_table}', error, elsewhere)
         found.append(Export(name, text + _csv(best), error, elsewhere=elsewhere))
     return tuple(found)
@@ -259,7 +260,7 @@ def pose_matrix(pose: Mapping[str, float]) -> FloatArray:
     return se3.transform(rotation.as_matrix(), np.array([pose[k] for k in 'xyz']))
 
 
-def head(chain: Chain, what: str, error: float, elsewhere: str = '') -> str:
+def head(chain: Chain, what: str, error: float, elsewhere: str = RANDOM) -> str:
     """Return the first line: a file's kind, its error [m], and the table of the chain."""
     name = re.sub(r'[^\w .-]', '_', chain.name)  # one line, one cell
     exact = f'up to {1e3 * error:.3f} mm off the calibrated arm{elsewhere}' if error else 'exact'

@@ -60,7 +60,8 @@ def test_every_form_says_how_far_it_is_from_the_calibration(name):
     assert by_name['dh_standard.csv'].error == by_name['kinematics.yaml'].error == 0.0
     offsets = by_name['joint_offsets.csv']
     assert 1e-4 < offsets.error < 0.02
-    assert f'{1e3 * offsets.error:.3f} mm off' in offsets.content.splitlines()[0]
+    told = f'{1e3 * offsets.error:.3f} mm off the calibrated arm at 1,000 random poses'
+    assert told in offsets.content.splitlines()[0]
     # Beta can be given up where no axes are parallel, and only there.
     assert (by_name['dh_without_beta.csv'].error < 1e-7) == (not nominal.parallel)
 
@@ -322,9 +323,9 @@ def test_the_command_line_fits_tables_to_the_measured_region(files, tmp_path):
     near = files('--measured', 'measured.csv')
     assert error(near) < 0.5 * error(files())
     first = near['dh_without_beta.csv'].partition('\n')[0]
-    more = re.search('arm at the measured joint values, (.*) mm over the joint range;', first)
+    more = re.search('arm at the measured joint values, (.*) mm at 1,000 random poses;', first)
     assert float(more.group(1)) > error(files())
-    assert 'over the joint range' not in files()['dh_without_beta.csv']
+    assert 'measured' not in files()['dh_without_beta.csv']
     rows = csv.DictReader(near['dh_without_beta.csv'].splitlines()[1:])
     assert all(float(row['beta']) == 0.0 for row in rows)
 
