@@ -196,15 +196,15 @@ def parse_urdf(text: str) -> Description:
 def _robot(text: str) -> ET.Element:
     if _DOCTYPE.search(text):
         raise ConfigError(
-            'the URDF has a <!DOCTYPE>, whose entities can stand for anything: remove it; no '
-            'URDF needs one'
+            'the URDF has a <!DOCTYPE>, whose entities can stand for anything: remove it'
         )
     if len(text) > LARGEST_TEXT:
         raise ConfigError(f'the URDF is larger than {LARGEST_TEXT // 1_000_000} MB')
     try:
         root = _parsed(text)
     except (expat.ExpatError, ValueError) as err:  # ValueError: not UTF-8
-        raise ConfigError(f'the URDF is not valid XML: {err}') from err
+        path = '; expected its text: load_chain reads a file' * ('<' not in text)
+        raise ConfigError(f'the URDF is not valid XML: {err}{path}') from err
     if any('xacro:' in element.tag for element in root.iter()):
         raise ConfigError('this is a xacro file, not a URDF: run "xacro FILE > robot.urdf" first')
     if root.tag != 'robot':

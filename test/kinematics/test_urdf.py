@@ -245,6 +245,7 @@ def pair(*prefixes):
 XACRO = '<xacro:x xmlns:xacro="http://www.ros.org/wiki/xacro"/></robot>'
 REFUSED = {
     'no XML': ('name: ur10e', 'not valid XML'),
+    'a path': ('arm.urdf', 'expected its text: load_chain reads a file'),
     'cut off': (UR10E[:-40], 'not valid XML'),
     'no robot': ('<sdf/>', 'root element <robot>, not <sdf>: convert it'),
     'empty': ('<robot/>', 'tree with one root; roots here: none'),
