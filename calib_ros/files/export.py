@@ -196,10 +196,13 @@ def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> st
     if slides := [joint.name for joint in form.joints if joint.type == 'prismatic']:
         document['prismatic'] = slides
     digest = hashlib.sha256(dump_yaml(document).encode()).hexdigest()
-    document['hash'] = f'sha256_{digest}'
-    if origin:
-        document['calibration'] = dict(origin)
-    return dump_yaml(document)
+    return labelled({**document, 'hash': f'sha256_{digest}'}, origin)
+
+
+def labelled(document: Mapping[str, Any], origin: Mapping[str, Any] | None) -> str:
+    """Return a file for vendors with the origin of its numbers, less its region of 100 kB."""
+    known = {name: each for name, each in (origin or {}).items() if name != 'region'}
+    return dump_yaml({**document, 'calibration': known} if known else dict(document))
 
 
 def origins(form: Chain) -> FloatArray:

@@ -157,7 +157,7 @@ def _document(
         document: dict[str, Any] = {'kinematics': {**poses, 'hash': checksum or f'calib_{number}'}}
     else:
         document = {key: {'kinematic': pose} for key, pose in poses.items()}
-    return dump_yaml({**document, 'calibration': dict(origin)} if origin else document)
+    return export.labelled(document, origin)
 
 
 def _layout(
