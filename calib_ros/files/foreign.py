@@ -150,7 +150,7 @@ class _Table:
             own |= zip(called, ours_of, strict=True)
         if not alone:
             own |= {name: name for name in (*NUMBERS, *WORDS)}
-        self._sheet = read_sheet(path, layout, list(needed), list(own))
+        self._sheet = read_sheet(path, layout, list(needed), own)
         self.names = tuple(name_and_unit(name)[0] for name in self._sheet.header)
         self.has = f'it has {listed(self._sheet.header)}'
         kept, left = without_statistics(self._sheet.columns)

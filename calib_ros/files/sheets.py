@@ -10,7 +10,7 @@ from __future__ import annotations
 import codecs
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import accumulate, chain, islice, zip_longest
@@ -56,12 +56,15 @@ class Sheet:
     words: tuple[str, ...]
     columns: Columns
     notes: tuple[str, ...]
+    known: Mapping[str, str]  # theirs that need no option, and ours
 
     def number(self, name: str) -> str | None:
-        """Return `#k` of a column by its name, None if unknown."""
+        """Return `#k` of a column by its name, or by ours if it is known by that; else None."""
         if name.startswith('#'):
             return name if 0 < int(name[1:]) <= len(self.header) else None
-        found = places(self.header, name)
+        found, low = places(self.header, name), [each.lower() for each in self.header]
+        for theirs in [each for each, ours in self.known.items() if ours == name]:
+            found = found or places(low, theirs.lower())
         return f'#{only(found, name) + 1}' if found else None
 
     def called(self, number: str) -> str:
@@ -80,7 +83,9 @@ class _Content:
     blanks: bool = False  # separate the cells
 
 
-def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence[str]) -> Sheet:
+def read_sheet(
+    path: Path, layout: Layout, names: Sequence[str], known: Mapping[str, str]
+) -> Sheet:
     """Read a table with a known layout; of a workbook the sheet named, or the first that fits.
 
     The header is the first line with all column `names`; if these are only numbers, the first with
@@ -137,7 +142,7 @@ def _of_text(path: Path, layout: Layout) -> _Content:
 
 
 def _sheet(
-    path: Path, content: _Content, layout: Layout, names: Sequence[str], known: Sequence[str]
+    path: Path, content: _Content, layout: Layout, names: Sequence[str], known: Mapping[str, str]
 ) -> Sheet:
     rows, notes = content.rows, content.notes
     whole = list[Cells]()
@@ -181,7 +186,7 @@ def _sheet(
     header = (*header, *[''] * (len(columns.header) - len(header)))
     between = ' ' if content.blanks else '\t'
     words = (*content.comments, *(between.join(cells) for _, cells in (*above, *left)))
-    return Sheet(path, header, words, replace(columns, decimal=decimal), tuple(notes))
+    return Sheet(path, header, words, replace(columns, decimal=decimal), tuple(notes), known)
 
 
 def _refuse_shifted(columns: Columns, width: int) -> None:
@@ -322,7 +327,7 @@ def _separator(path: Path, text: str) -> str:
 
 
 def _header(
-    path: Path, rows: Sequence[Cells], names: Sequence[str], known: Sequence[str]
+    path: Path, rows: Sequence[Cells], names: Sequence[str], known: Mapping[str, str]
 ) -> tuple[int, tuple[str, ...]]:
     """Return the row index of the header, and its names; -1 if there is none."""
     rows = rows[:HEAD_LINES]
@@ -331,7 +336,8 @@ def _header(
     bare = [{*cells, *(name_and_unit(cell)[0] for cell in cells)} for _, cells in rows]
     wanted = {name for name in names if not name.startswith('#')}
     if wanted:
-        missing = [wanted - each for each in bare]
+        ours = {theirs.lower(): name for theirs, name in known.items()}
+        missing = [wanted - each - {ours.get(name.lower()) for name in each} for each in bare]
         fewest = min(missing, key=len)
         if len(fewest) < len(wanted):
             at = missing.index(fewest)

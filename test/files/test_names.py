@@ -45,6 +45,18 @@ def test_columns_of_a_table_without_a_header_are_proposed_by_their_numbers(tmp_p
     np.testing.assert_array_equal(table.fitted[0].joints, JOINTS)
 
 
+@pytest.mark.parametrize('header', ['Q1,Q2,X,Y,Z', 'Shoulder [rad],elbow,X [m],Y [m],z [m]'])
+def test_options_may_use_our_names_for_columns_that_need_none(tmp_path, header):
+    """As messages about mistakes propose them: the table was said to have no column q1 or y."""
+    path = tmp_path / 'cell.csv'
+    path.write_text('a title\n' + header + PLAIN[PLAIN.index('\n') :])
+    found, *_ = read(path, preset='', columns=['q1=q2,q2=-q1,y=2*y'], given={}).fitted
+    np.testing.assert_allclose(found.joints, JOINTS[:, ::-1] * [1, -1])
+    np.testing.assert_allclose(found.positions, PLACES * [1, 2, 1])
+    with pytest.raises(InputError, match='no column q3'):
+        read(path, preset='', columns=['q1=q3'], given={})
+
+
 def names(form):
     return [form.format(axis) for axis in 'XYZ']
 
