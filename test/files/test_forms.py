@@ -22,6 +22,7 @@ FORMS = {
     'no values': PLAIN + '0.2,0.3,n/a,#N/A,-\n0,0,nan,null,\n0, 0, nan, -, \n',
     'a header of numpy': '# ' + PLAIN,
     'a header of numpy with blanks': '# two joints\n# ' + PLAIN.replace(',', ' '),
+    'a header of numpy with tabs': '#\t' + PLAIN.replace(',', '\t'),
     'a header of SpatialAnalyzer': '//' + PLAIN,
     'whole lines in quotes': re.sub('(?m)^.+$', r'"\g<0>"', PLAIN),
     'quotes below a plain header': re.sub('(?m)^([0-9-].*?);', r'"\1";', PLAIN.replace(',', ';')),
