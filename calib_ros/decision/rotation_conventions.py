@@ -35,7 +35,7 @@ def misread() -> Iterator[tuple[str, str, Turn]]:
     """Yield mistakes, remedies, and functions from rotations (N, 3, 3) as read to those meant."""
     in_radians, so = '--angle rad, with --joint-angle for the joints', ', or convert them so'
     for read in ORDERS:
-        now = ', '.join(f'r{axis.lower()}' for axis in read)
+        now = ','.join(f'r{k}=r{axis.lower()}' for k, axis in enumerate(read, 1))
         angles = f'Euler angles {_order(read)}'
         for meant in ORDERS:
             if meant == read:
@@ -44,7 +44,7 @@ def misread() -> Iterator[tuple[str, str, Turn]]:
             what, turn = f'the Euler angles are {_order(meant)}', _reinterpret(read, meant, meant)
             yield f'{what}, not {_order(read)}', f'--euler {meant}{so}', turn
             what += f' in the order of their columns, not {_order(read)}'
-            remedy = f'--euler {meant} with r1, r2, r3 (now {now}){so}'
+            remedy = f'--euler {meant} --columns {now} (if so called){so}'
             yield what, remedy, _reinterpret(read, meant, read)
         turn = _reinterpret(read, VECTOR, 'XYZ')
         yield f'the angles are rotation vectors, not {angles}', f'--rotation-vector{so}', turn

@@ -88,7 +88,7 @@ def _rotations(made: Columns, layout: Layout) -> tuple[FloatArray | None, FloatA
             if getattr(layout, name):
                 raise ConfigError(
                     f'{made.path}: {name.replace("_", " ")} is given, but no columns: --columns '
-                    'rx=NAME,ry=NAME,rz=NAME (or qx, qy, qz, qw)'
+                    'rx=NAME,ry=NAME,rz=NAME (r1, r2, r3: in their order; or qx, qy, qz, qw)'
                 )
         return None, None
     if len(three) > 1:

@@ -91,7 +91,7 @@ SPOILT = {
     ),
     'Euler columns': (
         lambda e: replace(e, rotations=_in_turn(e.rotations)),
-        '--euler ZYX with r1, r2, r3 (now rx, ry, rz)',
+        '--euler ZYX --columns r1=rx,r2=ry,r3=rz (if so called)',
     ),
     'vectors': (rewritten('XYZ', ''), '--rotation-vector'),
     'no vectors': (rewritten('', 'XYZ'), '--euler XYZ'),

@@ -16,6 +16,7 @@ from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, layout_of
 from calib_ros.files.names import turns_in
+from calib_ros.files.vocabulary import TURNS
 from calib_ros.kinematics.chain import Joint
 
 ARM = Chain('arm', 'standard', (Joint('shoulder'), Joint('elbow')))
@@ -288,6 +289,15 @@ def test_the_option_for_angles_is_told(tmp_path, angles, option):
     columns, euler = re.search('--columns "(.*)" --euler (.*)', note).groups()
     assert_same(
         read(path, preset='', columns=[columns], given={'euler': euler, 'joint_angle': 'rad'})
+    )
+
+
+def test_angles_named_by_their_axes_may_be_in_the_order_of_the_letters(tmp_path):
+    """As a message about mistakes proposes; with rx, ry, rz beside them it could not be done."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(text_of(JOINTS, PLACES, TURNED.as_euler('ZYX'), names=[*NAMES, *TURNS]))
+    assert_same(
+        read(path, preset='', columns=['r1=rx,r2=ry,r3=rz'], given={'euler': 'ZYX'}), TURNED
     )
 
 
