@@ -16,7 +16,7 @@ BEGINNINGS = (
     *((mark, 'bag') for mark in (b'\x89MCAP', b'SQLite format 3', b'\x28\xb5\x2f\xfd')),
     *((mark, 'image') for mark in (b'\x89PNG', b'\xff\xd8\xff')),
     *((mark, 'report') for mark in (b'%PDF', b'<!doctype html')),
-    *((mark, 'native') for mark in (b'&ACCESS', b'DEFDAT')),
+    *((mark, 'native') for mark in (b'&ACCESS', b'DEFDAT', b'DEF ', b'MODULE ', b'/PROG')),
 )
 NATIVE = ('.src', '.mod', '.prg', '.ls', '.tp', '.script', '.urp', '.pgx', '.dtx', '.jbi')
 KIND_OF_SUFFIX = {

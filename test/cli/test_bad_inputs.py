@@ -101,6 +101,12 @@ def bad_inputs():
         "start.dtx is a program in a robot's own language, but --joints takes a table: write",
     )
     yield 'a program by its beginning', (*bag_of, 'good.csv', '--joints', 'part.dat'), 'but --jo'
+    for given in ('rapid.txt', 'fanuc.txt', 'universal.csv'):
+        yield (
+            f'a program in {given}',
+            (*bag_of, 'good.csv', '--joints', given),
+            'but --joints takes',
+        )
     yield (
         'a program of KUKA to compensate',
         ('compensate', 'move.dat', '--chain', 'ur5e', '--calibration', 'none', '--out', 'o.csv'),
@@ -130,6 +136,9 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     (tmp_path / 'own.yaml').write_text(dump_chain(load_chain('ur5e'), {'source': 'x'}))
     (tmp_path / 'move.dat').write_text('&ACCESS RVP\nDEFDAT MOVE\nENDDAT\n')
     (tmp_path / 'part.dat').write_text('DEFDAT MOVE\nDECL E6AXIS XP1={A1 1.0,A2 2.0}\nENDDAT\n')
+    (tmp_path / 'rapid.txt').write_text('MODULE Cal\n  CONST jointtarget p1:=[[1,2]];\n')
+    (tmp_path / 'fanuc.txt').write_text('/PROG  CAL\n/POS\nP[1]{\n  J1= 1.0 deg\n};\n')
+    (tmp_path / 'universal.csv').write_text('def cal():\n  movej([1.0, 2.0])\nend\n')
     (tmp_path / 'start.dtx').write_text('<?xml version="1.0"?><Database/>')
     (tmp_path / 'poses.xlsx').write_bytes(b'PK\3\4\0')
     (tmp_path / 'shot.png').write_bytes(b'\x89PNG\xff')
