@@ -37,6 +37,10 @@ class Visibility:
                 f'the box from {self.box[0].tolist()} to {self.box[1].tolist()} is empty: give '
                 'the lower corner first'
             )
+        for name, given in (('box', self.box), ('tracker', self.tracker)):
+            far = () if given is None or self.world else np.abs(given).ravel()
+            if any(100.0 < each < np.inf for each in far):
+                raise ConfigError(f'the {name} must be in metres (300 mm is 0.3), not {given}')
         if not np.linalg.norm(self.axis) > 0.0:
             raise ConfigError('the axis of the target must not be 0 0 0')
         if not 0.0 < self.cone <= np.pi:

@@ -54,8 +54,8 @@ class Compensator(Shown, Limits):
         check_fields(self)
         known = 'the nominal chain', self.nominal
         refuse_other_joints('the calibrated chain', self.calibrated, *known)
-        if not np.isfinite(self.tool).all():
-            raise ConfigError(f'tool must be three finite numbers [m], not {self.tool}')
+        if not (np.abs(self.tool) <= 5.0).all():
+            raise ConfigError(f'tool must be within 5 m, not {self.tool}: 150 mm is 0.15')
         for name in (item.name for item in fields(Limits)):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < np.inf:

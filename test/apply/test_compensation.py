@@ -284,7 +284,8 @@ def test_approaches_are_the_last_moves():
         ({'largest_change': np.nan}, 'largest_change must be of type float, not nan'),
         ({'orientation_weight': -1.0}, 'orientation_weight must be a positive number'),
         ({'tool': (0.0, 0.0)}, r'tool must be of type .* not \(0.0, 0.0\)'),
-        ({'tool': (0.0, np.inf, 0.0)}, 'tool must be three finite numbers'),
+        ({'tool': (0.0, np.inf, 0.0)}, 'tool must be within 5 m'),
+        ({'tool': (0.0, 0.0, 150.0)}, 'tool must be within 5 m, not .*: 150 mm is 0.15'),
     ],
 )
 def test_settings_out_of_range_are_refused(setting, complaint):

@@ -68,6 +68,15 @@ def test_a_region_out_of_reach_is_refused(rng):
         Visibility(axis=(0.0, 0.0, 0.0))
 
 
+def test_places_in_mm_are_refused():
+    """A tracker at 3 km saw every pose from one side; of a box no message named the unit."""
+    box, tracker = np.array([[200.0, -600.0, 100.0], [900.0, 600.0, 900.0]]), [3000.0, 0.0, 1000.0]
+    for given in ({'box': box}, {'tracker': np.array(tracker)}):
+        with pytest.raises(ConfigError, match='must be in metres'):
+            Visibility(**given)
+        Visibility(**given, world=True)  # the coordinates of a plant
+
+
 def test_plan_writes_joint_values_in_order_of_visit(run, tmp_path):
     status, out, err = run('plan', '--chain', 'ur10e', '--poses', 25, '--out', 'plan.csv')
     assert (status, err) == (0, '')
