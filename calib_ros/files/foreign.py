@@ -162,9 +162,8 @@ class _Table:
             own = {name: own[name] for name in own if name not in {*ours_of} - {*called}}
         if not alone:
             own |= {name: ours for ours, name in quaternions_in(self.names).items()}
-        other = TURNS if {*IN_TURN} & {*asked} else IN_TURN * bool({*TURNS} & {*asked})
-        taken = {*asked, *other}  # r1=rx leaves no rx
-        named = self._named({name: own[name] for name in own if own[name] not in taken})
+        taken = TURNS if {*IN_TURN} & {*asked} else IN_TURN * bool({*TURNS} & {*asked})  # r1=rx
+        named = self._named({n: ours for n, ours in own.items() if ours not in (*asked, *taken)})
         self._columns |= named
         if joints and chain is not None:
             self._complete(chain)

@@ -220,9 +220,8 @@ def named_in(header: Sequence[str], joint: str) -> str:
 def numbers_in(header: Sequence[str]) -> list[str]:
     """Return the numbers `#k` of columns that a header calls by values, as a row without one."""
     whole = [k for k, name in enumerate(header, 1) if re.fullmatch(r'-?[\d.,]+(e[+-]?\d+)?', name)]
-    values = [k for k in whole if re.search('[.,]', header[k - 1])]  # 1 to 6 may name joints
-    of_row = len(whole) == len(header) or len(values) > 1
-    return [f'#{k}' for k in whole] * of_row
+    values = sum(re.search('[.,]', header[k - 1]) is not None for k in whole)  # 1 may be a name
+    return [f'#{k}' for k in whole] * (len(whole) == len(header) or values > 1)
 
 
 def _no_joint(name: str) -> bool:

@@ -66,11 +66,6 @@ def _columns(path: Path) -> tuple[Columns, str, str]:
     return found, separator, text
 
 
-def _with_decimals(found: Columns, names: Sequence[str]) -> Columns:
-    cells = (cell for name in names for cell in found.texts(name))
-    return replace(found, decimal=decimal_sign(cells))
-
-
 def check_limits(
     values: FloatArray,
     chain: Chain,
@@ -132,7 +127,7 @@ def _program(found: Columns, chain: Chain) -> tuple[Columns, tuple[str, ...], Fl
         )
     given = [k for k, column in enumerate(columns) if column in found.header]
     named = [columns[k] for k in given]
-    found = _with_decimals(found, named)
+    found = replace(found, decimal=decimal_sign(c for n in named for c in found.texts(n)))
     values = found.block(named) * units[given]
     return found, tuple(columns), units, Program(tuple(joints[k] for k in given), values)
 
@@ -162,7 +157,8 @@ def read_poses(path: Path) -> FloatArray:
     table, *_ = _columns(path)
     columns = [_column(table, name) for name in POSE_COLUMNS]
     how = '; lengths are in m, or in the unit named there: x [mm]'
-    found = _with_decimals(with_rows(table, columns, how), columns)
+    found = with_rows(table, columns, how)
+    found = replace(found, decimal=decimal_sign(c for n in columns for c in found.texts(n)))
     numbers = found.block(columns)
     numbers[:, :3] *= _units(found, dict.fromkeys(columns[:3], LENGTHS))
     check_quaternions(found, numbers[:, 3:])
