@@ -121,7 +121,7 @@ def _of_text(path: Path, layout: Layout) -> _Content:
         comment = re.compile(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$')
         comments, text = comment.findall(text), comment.sub('', text)
     # a header, as numpy and SpatialAnalyzer write it; # before a tab is a name if rows have it
-    head = re.match(r'#\t(.*)\n(.*)', text)
+    head = re.match(r'#\t(.*)\n(?!\d+\t)(.*)', text)  # a count may be beside an empty cell
     text = text[2:] if head and head[1].count('\t') == head[2].count('\t') else text
     text = re.sub(r'(?m)^(?!#\t)(?:[#%]+[ \t]+|//[ \t]*)(?=[A-Za-z])', '', text)
     if text.startswith('"') and not re.search(r'(?m)^(?!"[^"\n]*"$)[^\n]', text):  # one cell each

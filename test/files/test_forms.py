@@ -23,6 +23,8 @@ FORMS = {
     'a header of numpy': '# ' + PLAIN,
     'a header of numpy with blanks': '# two joints\n# ' + PLAIN.replace(',', ' '),
     'a header of numpy with tabs': '#\t' + PLAIN.replace(',', '\t'),
+    'a count, and remarks cut off': '#\t'
+    + PLAIN.replace(',', '\t').replace('\n', '\tnote\n', 1).replace('\n', '\n1\t', 3),
     'a header of SpatialAnalyzer': '//' + PLAIN,
     'whole lines in quotes': re.sub('(?m)^.+$', r'"\g<0>"', PLAIN),
     'quotes below a plain header': re.sub('(?m)^([0-9-].*?);', r'"\1";', PLAIN.replace(',', ';')),
