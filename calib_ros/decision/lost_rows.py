@@ -25,7 +25,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import flange
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
-from calib_ros.kinematics.se3 import Flags, FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, Flags, FloatArray
 from calib_ros.settings import EXCEPTION
 from calib_ros.shown import rows_in_words
 
@@ -103,7 +103,7 @@ def dead(chain: Chain, sets: Sets) -> Suspect | None:
         if each.socket or len(each) < TELLING:
             continue
         seen = each.given
-        held = np.flatnonzero(np.ptp(seen, axis=0) == 0.0)
+        held = np.flatnonzero(np.ptp(seen, axis=0) <= ROUNDING * np.abs(seen).max())
         places = replace(chain, tool=None).forward(each.joints)[:, :3, 3]
         spreads = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
         if len(held) and spreads[2] > NEARER**2 * spreads[0]:
