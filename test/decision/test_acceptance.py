@@ -13,7 +13,7 @@ from scipy import stats
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision import acceptance
 from calib_ros.decision.acceptance import _loss_by_chance, oddities, refusals
-from calib_ros.decision.reasons import Rule
+from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.levels import CERTAIN
 from calib_ros.estimation.problem import Problem
@@ -62,6 +62,11 @@ def test_orientations_may_get_worse_by_half_a_per_cent_and_positions_be_off_by_t
     gross = replace(held_out, judged=np.arange(len(held_out.judged)) >= 24)
     (outliers,) = refusals(problem, replace(result, validation=gross), None, False, True)
     assert outliers.startswith('40 % of the judged poses are outliers')
+    for harmful in (False, True):
+        step = SimpleNamespace(harmful=harmful, reason=Reason(Rule.MOVED, 'the device moved'))
+        judged = replace(result, validation=gross, step=step)
+        found = refusals(problem, judged, None, False, True)
+        assert [each.rule for each in found] == [Rule.MOVED, Rule.OUTLIERS]
 
 
 @pytest.mark.parametrize(('tilt', 'told'), [(0.9e-3, True), (1.1e-3, False)])

@@ -170,6 +170,9 @@ def test_whether_rounding_explains_the_gain_is_an_f_test(rng, monkeypatch):
     fitted = fit(problem)[2]
     rounding.may_be_rounding(fitted, before, {'elbow_joint': 1e-3})
     frames = [name for name in fitted.names if before.owns_frame(name)]
+    assert not rounding.may_be_rounding(
+        replace(fitted, names=frames), before, {'elbow_joint': 1e-3}
+    )
     own = [name for name in fitted.names if name not in frames]
     parts = problem.system(problem.sets).rows_of(before, [*frames, *own])
     rows, level = stacked(parts), level[owners(parts)]
