@@ -297,3 +297,10 @@ def test_the_scale_is_that_of_what_measures_lengths():
         _, lengths, scale = lengths_of(UR, System(samples, None, apart))
         assert (bool(lengths), scale) == (True, pytest.approx(expected))
         assert not lengths_of(UR, System((samples_of(plane, (1.0, 1.0), 1.0),)))[1]
+    q = GANTRY.random_joints(9, np.random.default_rng(0))
+    there = Observations.from_arrays(q, np.zeros((9, 3)))
+    system = System((Samples(there, 1.0, 1.0),))
+    chain, lengths, _ = lengths_of(GANTRY, system)  # of travels too: all of the position
+    (rows,) = system.rows_of(chain, tuple(lengths))
+    grown = np.tensordot([*lengths.values()], rows[:-1], 1).T
+    np.testing.assert_allclose(grown, GANTRY.forward(q)[:, :3, 3], atol=1e-12)
