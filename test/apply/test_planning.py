@@ -13,7 +13,7 @@ from scipy.spatial.distance import pdist
 from calib_ros import Chain, Problem, identify, load_chain, read_table
 from calib_ros.apply import planning
 from calib_ros.apply.candidates import visit_order
-from calib_ros.apply.design import Design, accuracy
+from calib_ros.apply.design import Candidates, Design, accuracy
 from calib_ros.apply.planning import choose
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.identifiability import observability
@@ -53,6 +53,10 @@ def test_no_choice_is_better_than_all():
     design = design_of(POSITIONER)
     q, task = some(POSITIONER, 9), some(POSITIONER, 30, 7)
     assert planning.efficiency(design, q, np.arange(9), task) == pytest.approx(1.0)
+    space = Candidates(design, q)
+    square = space.of_task(task)
+    wanted = np.trace(space.rows @ square @ np.swapaxes(space.rows, 1, 2), axis1=1, axis2=2)
+    np.testing.assert_allclose(space.traces(square), wanted)
 
 
 @pytest.mark.parametrize('criterion', ['o3', 'o5'])
