@@ -169,8 +169,7 @@ def in_doubt(header: Sequence[str], plain: Sequence[str], joints: int = 0) -> st
         [names for words, names in known.items() if words & some]
         for some in (MEASURED_WORDS, NOMINAL_WORDS, DEVIATION)
     )
-    told = MEASURED_WORDS | NOMINAL_WORDS | DEVIATION
-    others = [names for words, names in known.items() if words and not words & told]
+    others = [names for words, names in known.items() if words]
     beside = next(iter(measured or ([] if nominal else apart or others)), plain)
     if len(plain) == len(POSITION) and beside != [*plain]:
         of_sum = beside in apart and beside not in measured
