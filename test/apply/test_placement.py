@@ -184,8 +184,9 @@ def test_an_arm_with_fewer_freedoms_than_a_pose_can_be_given_a_task(model):
     one = in_base(chain, np.array([[0.4, 0.9, 0.1, 0.3]]))[0]
     task = transform(np.broadcast_to(one[:3, :3], (6, 3, 3)), steps)
     found = place(arm, task, 'mean', model, cells=5)
-    poses = chain.forward(found.joints[found.best])
-    meant = wanted(chain, found, found.best, task)
-    np.testing.assert_allclose(poses[:, :3, 3], meant[:, :3, 3], rtol=0.0, atol=1e-6)
-    assert np.linalg.norm(poses[:, :3, :3] - meant[:, :3, :3], axis=(1, 2)).max() < 0.03
-    assert np.count_nonzero(~np.isnan(found.errors)) > 5
+    reached = np.flatnonzero(~np.isnan(found.errors)).tolist()
+    assert len(reached) > 5
+    for which in reached:
+        poses, meant = chain.forward(found.joints[which]), wanted(chain, found, which, task)
+        np.testing.assert_allclose(poses[:, :3, 3], meant[:, :3, 3], rtol=0.0, atol=1e-6)
+        assert np.linalg.norm(poses[:, :3, :3] - meant[:, :3, :3], axis=(1, 2)).max() < 0.03
