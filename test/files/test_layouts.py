@@ -348,7 +348,7 @@ def test_numbers_of_poses_in_another_order_are_refused(tmp_path, ours, theirs, c
 def test_joint_values_and_coordinates_name_no_poses(tmp_path):
     """Whole degrees in another order than the numbers of the poses were refused."""
     (tmp_path / 'points.csv').write_text('Nr,x,y,z\n1,2,9,0\n2,1,9,0\n3,4,9,0\n4,3,9,0\n')
-    (tmp_path / 'log.csv').write_text('q1\n4\n3\n2\n1\n')
+    (tmp_path / 'log.csv').write_text('Celsius,q1\n20,4\n22,3\n23,2\n21,1\n')
     given = Foreign(Layout(), None, tmp_path / 'log.csv')
     (found,) = read_table(tmp_path / 'points.csv', 1, foreign=given).fitted
     assert found.joints[:, 0].tolist() == [4.0, 3.0, 2.0, 1.0]
@@ -357,8 +357,9 @@ def test_joint_values_and_coordinates_name_no_poses(tmp_path):
 def test_a_column_of_targets_that_was_given_is_read_beside_one_of_poses(tmp_path):
     """Where poses were matched by a column Target, both targets were taken for one."""
     (tmp_path / 'log.csv').write_text('Target,q1\nP1,1\nP2,2\n')
-    (tmp_path / 'points.csv').write_text('Target,Probe,x,y,z\nP1,a,1,0,0\nP2,b,2,0,0\n')
-    given = Foreign(Layout(columns={'target': 'Probe'}), None, tmp_path / 'log.csv')
+    points = 'Target,My probe,x,y,z\nP1,a 1,1,0,0\nP2,b 2,2,0,0\n'.replace(',', '\t')
+    (tmp_path / 'points.csv').write_text(points)  # the blanks separate nothing
+    given = Foreign(Layout(columns={'target': '{My probe}'}), None, tmp_path / 'log.csv')
     found = read_table(tmp_path / 'points.csv', 1, foreign=given).fitted
     assert [len(each) for each in found] == [1, 1]
 
