@@ -35,7 +35,7 @@ from calib_ros.estimation.samples import Samples, residual_arrays
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import require_lens
-from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.shown import counted
@@ -45,15 +45,17 @@ def start_frames(problem: Problem) -> Chain:
     """Return the model with base and tool frames that bring it close to the measurements.
 
     Sets with more equations come first, as one or two poses of a tool place no device; frames
-    found by them are kept.
+    found by them are kept. A point seen from the flange comes last, as it turns no base.
     """
     chain, sigmas = problem.model, (problem.sigma_position, problem.sigma_orientation)
     found: set[str] = set()
-    equations = [
+    counts = [
         distinct(each.configurations) * kind.rows
         for each, kind in zip(problem.sets, problem.kinds, strict=True)
     ]
-    for number in sorted(range(len(equations)), key=equations.__getitem__, reverse=True):
+    pairs = zip(problem.sets, counts, strict=True)
+    order = [(not each.seen and count > 2 * IN_A_FRAME, count) for each, count in pairs]
+    for number in sorted(range(len(order)), key=order.__getitem__, reverse=True):
         observations = problem.sets[number]
         placed = {name: replace(chain.frame(name), fixed=True) for name in found}
         known = {**chain.all_frames, **placed}

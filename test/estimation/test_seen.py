@@ -15,8 +15,10 @@ from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples, residual_arrays
+from calib_ros.estimation.start import start_frames
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
+from calib_ros.kinematics import se3
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.sampling.sample import Sample
 
@@ -52,6 +54,20 @@ def test_frames_that_are_known_stay(rng):
     result = identify(Problem(known, seen(true, UR10E.random_joints(40, rng))))
     assert result.accepted
     assert result.chain.frame('tool').matrix.tolist() == tool.matrix.tolist()
+
+
+def test_a_few_poses_of_a_board_turn_the_base(rng):
+    """Another camera sees its origin, more often."""
+    true = arm(rng)
+    others = UR10E.random_joints(8, rng)
+    board = se3.transform(se3.exp_rotation(np.array([2.0, 1.0, 0.5])), BALL)
+    poses = se3.invert(true.forward(others)) @ board
+    given = Observations.from_arrays(others, poses[:, :3, 3], poses[:, :3, :3]).inverted()
+    points = replace(seen(true, UR10E.random_joints(30, rng)), tool='tool_2')
+    problem = Problem(UR10E, given, more=(points,))
+    start = start_frames(problem)
+    for each in problem.sets:
+        assert np.abs(residual_arrays(start, each)[0]).max() < 0.05
 
 
 def test_noise_has_the_axes_of_the_camera(rng):
