@@ -185,7 +185,8 @@ def verify(
     comparison, left, uncorrected, chain = _compared(arm, sets, commanded, fitted, group)
     progress(2 / 3)
     moments = moments_of(comparison.after.position, group) + SAME**2 * np.eye(3)  # without noise
-    lost = IN_A_FRAME // 3 * new_base + new_tool  # the turn of a tool does not move the target
+    seen = all(each.seen for each in sets)  # else turns of the base count, not those of the tool
+    lost = (IN_A_FRAME // 3 - seen) * new_base + (1 + seen) * new_tool
     rms, numbers, freedom, lower, upper = _interval(moments, lost, confidence, DECIDING)
     mistake = _mistake(arm, sets, rms, 1e-3 * (comparison.figures[1].rms_mrad or 0.0))
     reused, limit = arm.reused(sets), tolerance or arm.limit(sets)

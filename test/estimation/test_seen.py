@@ -119,6 +119,16 @@ def test_a_ball_elsewhere_needs_a_new_base(rng):
     assert moved.common < 0.01
 
 
+def test_a_new_camera_costs_two_poses_and_a_new_ball_one(rng):
+    """The turn of a camera moves what it sees, that of a base does not."""
+    true = arm(rng)
+    known = Calibration.of(identify(Problem(UR10E, seen(true, UR10E.random_joints(40, rng)))))
+    few = [seen(true, UR10E.random_joints(6, rng))]
+    assert verify(known, few, 2e-4, new_base=True).verdict == 'PASS'
+    with pytest.raises(InputError, match='at least 7 are needed, 2 of them'):
+        verify(known, few, 2e-4, new_tool=True)
+
+
 def test_positions_are_turned_round_and_back(rng):
     given = Observations.from_arrays(UR10E.random_joints(5, rng), rng.normal(size=(5, 3)))
     turned = given.inverted()
