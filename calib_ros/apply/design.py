@@ -30,7 +30,7 @@ from calib_ros.shown import Shown
 
 ASSUMED_TOOL = 3 * (LEVER / 3.0,)
 """Assumed place of an unknown target [m] in the flange frame: on its axis, where an identity frame
-puts it, it hides the last joint."""
+puts it, it hides the last joint. So does a point seen from there at the origin of the base."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,6 +46,7 @@ class Design(Shown):
     known: FloatArray  # (R, P) rows of existing information, in sigma: priors, poses taken
     base: str = 'base'
     tool: str = 'tool'  # frames of the chain for further poses
+    seen: bool = False  # of a fixed point only its position from the flange is measured
 
     @classmethod
     @as_annotated
@@ -65,9 +66,10 @@ class Design(Shown):
         names: tuple[str, ...] = tuple(n for n in problem.free if n in structural or n in priors)
         scales = (1.0, 1.0)
         if result is None:
-            if model.all_frames[kind.tool] is None:
-                place = se3.transform(np.eye(3), np.array(ASSUMED_TOOL))
-                model = model.with_frame(kind.tool, Frame(place))
+            place = Frame(se3.transform(np.eye(3), np.array(ASSUMED_TOOL)))
+            for name in (kind.tool, *(kind.base,) * kind.seen):
+                if model.all_frames[name] is None:
+                    model = model.with_frame(name, place)
             known = np.diag([1.0 / priors.get(name, np.inf) for name in names])
         else:
             model = result.chain
@@ -87,15 +89,17 @@ class Design(Shown):
             known=known,
             base=kind.base,
             tool=kind.tool,
+            seen=kind.seen,
         )
 
-    def jacobian(self, joints: FloatArray) -> FloatArray:
-        """Return the Jacobian (N, 6, P) [m, rad] of poses at (N, n)."""
-        return ErrorModel(self.chain, self.names, self.base, self.tool).jacobian(joints)
+    def jacobian(self, joints: FloatArray, seen: bool = False) -> FloatArray:
+        """Return the Jacobian (N, 6, P) [m, rad] of poses at (N, n), or as they are `seen`."""
+        model = ErrorModel(self.chain, self.names, self.base, self.tool)
+        return model.jacobian(joints, seen=seen)
 
     def rows(self, joints: FloatArray) -> FloatArray:
         """Return the rows (N, 6 or 3, P) of information, in sigma, of poses at (N, n)."""
-        jacobian = self.jacobian(joints)
+        jacobian = self.jacobian(joints, self.seen)
         jacobian[:, :3] /= self.sigma_position
         if self.sigma_orientation is None:
             return jacobian[:, :3]

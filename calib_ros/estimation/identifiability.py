@@ -16,7 +16,6 @@ import numpy as np
 from scipy.linalg import lapack
 
 from calib_ros.estimation.sizes import TYPICAL
-from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -128,7 +127,7 @@ def drawn(
             anywhere = anywhere.with_offsets({n: x for n, x in shift.items() if n in names})
         model = ErrorModel(anywhere, names, kind.base, kind.tool)
         signs, rates = approach[: len(posed)], velocity[: len(posed)] if kind.moving else None
-        jacobian = model.jacobian(posed, signs, rates)
+        jacobian = model.jacobian(posed, signs, rates, kind.seen)
         if kind.distance:
             line = anywhere.forward(posed, signs, kind.base, kind.tool)[:, :3, 3]
             if kind.plane:
@@ -136,10 +135,7 @@ def drawn(
             line /= np.linalg.norm(line, axis=1, keepdims=True)
             jacobian = np.einsum('nc,ncp->np', line, jacobian[:, :3])
         elif not kind.oriented:
-            jacobian, turns = jacobian[:, :3], jacobian[:, 3:]
-            if kind.seen:  # the point is the world's origin
-                places = anywhere.forward(posed, signs, kind.base, kind.tool)[:, :3, 3]
-                jacobian = jacobian + se3.skew(places) @ turns
+            jacobian = jacobian[:, :3]
         rows.append(jacobian.reshape(-1, len(names)))
     return anywhere, rows
 

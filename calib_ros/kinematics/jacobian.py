@@ -135,18 +135,26 @@ class ErrorModel:
         return frames, target
 
     def jacobian(
-        self, q: FloatArray, approach: FloatArray | None = None, velocity: FloatArray | None = None
+        self,
+        q: FloatArray,
+        approach: FloatArray | None = None,
+        velocity: FloatArray | None = None,
+        seen: bool = False,
     ) -> FloatArray:
         """Return the Jacobian (N, 6, P) of position [m] and orientation [rad] at poses q (N, n).
 
         Rows 0-2 are the target's position in the world, rows 3-5 its rotation vector in world
-        axes: the orientation becomes exp(J[3:] dx) R.
+        axes: the orientation becomes exp(J[3:] dx) R. If `seen` rows 0-2 are the world's origin in
+        the frame of the target, with the sign and axes of the others.
         """
         rows = np.ascontiguousarray(self.chain.joint_values(q).T)
         signs = None if approach is None else np.ascontiguousarray(approach.T)
         moving = None if velocity is None else np.ascontiguousarray(velocity.T)
-        _, _, *found = self.linearise(rows, signs, moving)
-        return np.ascontiguousarray(self.twists(*found).transpose(2, 1, 0))
+        _, places, *found = self.linearise(rows, signs, moving)
+        twists = self.twists(*found).transpose(2, 1, 0)
+        if seen:
+            twists[:, :3] += se3.skew(places.T) @ twists[:, 3:]
+        return np.ascontiguousarray(twists)
 
     def shifts(self, q: FloatArray) -> FloatArray:
         """Return the derivatives (P, 3, N) of the target's position alone at poses q (N, n)."""

@@ -9,6 +9,7 @@ import pytest
 from fits import NOISE, UR10E, arm
 
 from calib_ros import CalibrationSession, Settings
+from calib_ros.apply.design import Design, accuracy
 from calib_ros.apply.verification import verify
 from calib_ros.decision.comparison import along_base, residuals
 from calib_ros.errors import InputError
@@ -19,6 +20,7 @@ from calib_ros.estimation.start import start_frames
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
+from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.sampling.sample import Sample
 
@@ -127,6 +129,23 @@ def test_a_new_camera_costs_two_poses_and_a_new_ball_one(rng):
     assert verify(known, few, 2e-4, new_base=True).verdict == 'PASS'
     with pytest.raises(InputError, match='at least 7 are needed, 2 of them'):
         verify(known, few, 2e-4, new_tool=True)
+
+
+def test_planned_poses_determine_what_is_fitted(rng):
+    """The camera's rotation too, before and after the first poses are measured."""
+    problem = Problem(UR10E, seen(arm(rng), UR10E.random_joints(40, rng)))
+    more, task = UR10E.random_joints(40, rng), UR10E.random_joints(100, rng)
+    planned = Design.of(problem)
+    assert np.isfinite(accuracy(planned, more, task)[-1])
+    result = identify(problem)
+    model, design = ErrorModel(result.chain, result.names), Design.of(problem, result)
+    jacobian = model.jacobian(more, seen=True)[:, :3]
+    rows = Samples(seen(result.chain, more, ball=np.zeros(3)), 1.0, 1.0)
+    expected = rows.rows_of(result.chain, result.names)[:-1].transpose(2, 1, 0)
+    turns = result.chain.forward(more)[:, :3, :3]
+    np.testing.assert_allclose(np.swapaxes(turns, 1, 2) @ jacobian, expected, atol=1e-9)
+    found = design.rows(more)[..., : len(result.names)] * design.sigma_position
+    np.testing.assert_allclose(found, jacobian, atol=1e-9)
 
 
 def test_positions_are_turned_round_and_back(rng):
