@@ -56,8 +56,7 @@ def row_loss(
     }
     for part, shift in product((rows < count // 3, rows >= count - count // 3), SLIPS):
         some = paired[shift].select(part[inside[shift]])
-        if (found := in_frames(problem, nominal, (some,))) is None:
-            continue
+        found = in_frames(problem, nominal, (some,))
         tables = {s: np.full(count, np.inf) for s in SLIPS}
         for s, pairs in paired.items():
             tables[s][inside[s]] = misses(found.chain, pairs, flange(found.chain, pairs))
@@ -164,7 +163,7 @@ def computed_rows(problem: Problem) -> str:
     for parts in (rows < third, rows >= len(seen) - third), (rows % 2 == 0, rows % 2 == 1):
         some = [each for each in map(alone.select, parts) if _covers(each, least)]
         trials = [in_frames(problem, arm, (each,)) for each in some]
-        found = sorted(filter(None, trials), key=lambda one: one.error)
+        found = sorted(trials, key=lambda one: one.error)
         if len(found) < 2 or found[1].error > largest_of(problem):
             continue
         if found[0].error < EXCEPTION**2 * found[1].error:

@@ -154,7 +154,7 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
     if not any(each.socket for each in sets):
         sets, where = unlike(problem, chain, sets)
     given = in_frames(problem, chain, sets)
-    if given is None or (far and given.error <= largest_of(problem)):
+    if far and given.error <= largest_of(problem):
         return None
     missing = None if _of_images(problem) else dead(chain, given.sets)
     found = missing and Explained((missing,), given.error, np.nan)  # no change restores it
@@ -200,8 +200,7 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | 
         return None
     for name in (seen.base, seen.tool):
         chain = chain.with_frame(name, replace(chain.frame(name), fixed=True))
-    if (given := trial_of(chain, (seen.select(rows).spread(),))) is None:
-        return None
+    given = trial_of(chain, (seen.select(rows).spread(),))
     found = _named(problem, given, _tried(problem, chain, given.sets, given, of_rows=True))
     if found is None or len(rows) == len(seen):
         return found
@@ -233,7 +232,7 @@ def _tried(
         if each.rows:
             few = tuple(_moved(problem, one, each.rows).spread() for one in sets)
         found = trial_of(each.chain or chain, each.undone(few))
-        if found is not None and found.share < given.share:
+        if found.share < given.share:
             rough.append((found, each))
     best = sorted(rough, key=lambda one: one[0].share)[:TRIED]
     tried = [(refined(problem, found), each) for found, each in best]
@@ -297,17 +296,13 @@ def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> E
     parts = [sizes <= least]
     if enough := third >= 2 * IN_A_FRAME:
         parts += [rows < third, rows >= 2 * third, rows % 2 == 0, rows % 2 == 1]
-    trials = [
-        in_frames(problem, chain, (whole.select(part),)) if part.sum() >= FEW else None
-        for part in parts
-    ]
-    for one in (given, *trials):
-        if one is None or one.error > largest_of(problem):
-            continue
-        if found := _of_rows(problem, one.chain, whole):
+    some = (whole.select(part) for part in parts if part.sum() >= FEW)
+    trials = [given, *(in_frames(problem, chain, (each,)) for each in some)]
+    for one in trials:
+        if one.error <= largest_of(problem) and (found := _of_rows(problem, one.chain, whole)):
             return found
     most = min(largest_of(problem), NEARER * given.error)
-    if not enough or any(one is None or one.error > most for one in trials[-2:]):
+    if not enough or any(one.error > most for one in trials[-2:]):
         return None
     two = Suspect(
         'odd and even rows are of two arms, or of two devices or targets',
@@ -326,8 +321,6 @@ def _by_places(
         return None
     alone = tuple(replace(each, oriented=np.zeros(len(each), dtype=bool)) for each in sets)
     placed = in_frames(problem, chain, alone)
-    if placed is None:
-        return None
     if placed.error <= min(problem.largest_error, NEARER * given.error):
         known = placed.error + LEVER * problem.sigma_orientation
         enough = known < NEARER * given.error
@@ -362,8 +355,7 @@ def _several(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
             if len({one.part for one in these}) == len(these):
                 more = tuple(sorted(these, key=lambda one: (*FIRST, one.part).index(one.part)))
                 trial = trial_of(chain, reduce(lambda sets, one: one.undone(sets), more, few))
-                if trial is not None:  # keeps the first of equivalent ones
-                    found.setdefault(round(trial.share, 6), (trial, more))
+                found.setdefault(round(trial.share, 6), (trial, more))  # first of equivalent ones
         best = [found[key] for key in sorted(found)[:TRIED]]
         if not best or (number and best[0][0].share > CONFIDENT * least):
             return None

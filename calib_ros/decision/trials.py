@@ -54,7 +54,7 @@ class Trial:
         return self.error / max(self.spread, 1e-9)
 
 
-def trial_of(chain: Chain, sets: Sets) -> Trial | None:
+def trial_of(chain: Chain, sets: Sets) -> Trial:
     """Return the chain with frames for some samples in closed form, set by set."""
     spreads, arms = [], []
     for each in sets:
@@ -63,13 +63,10 @@ def trial_of(chain: Chain, sets: Sets) -> Trial | None:
         known = chain.all_frames  # other robots have only a base and a tool
         own = replace(chain, base=known.get(each.base), tool=known.get(each.tool))
         best = _nearest(own, alone, arm, np.ones(len(alone), dtype=bool))
-        if best is None:
-            return None
         away = misses(best.chain, alone, arm)  # a gross error would hide a mistake
         usual = away <= _usual(away)
         if np.count_nonzero(usual) >= 2 * IN_A_FRAME:  # base and tool explain fewer
-            found = best, _nearest(own, alone, arm, usual)
-            best = min(filter(None, found), key=lambda one: one.error)
+            best = min(best, _nearest(own, alone, arm, usual), key=lambda one: one.error)
         places = arm[:, :3, 3]
         fixed = each.socket or each.seen
         seen = places if fixed else each.positions  # sockets measure nothing
@@ -93,10 +90,9 @@ def as_poses(problem: Problem, each: Observations) -> Observations:
     return board_poses(each, require_lens(problem.chain.frame(each.camera).lens, each.camera))
 
 
-def in_frames(problem: Problem, chain: Chain, sets: Sets) -> Trial | None:
+def in_frames(problem: Problem, chain: Chain, sets: Sets) -> Trial:
     """Return the arm as given, in the frames that suit it best."""
-    given = trial_of(chain, tuple(each.spread() for each in sets))
-    return None if given is None else refined(problem, given)
+    return refined(problem, trial_of(chain, tuple(each.spread() for each in sets)))
 
 
 def largest_of(problem: Problem) -> float:
@@ -116,7 +112,7 @@ def fits_each_side(problem: Problem, seen: Observations, stamp_ns: int) -> bool:
     if min(np.count_nonzero(before), np.count_nonzero(~before)) < 2 * IN_A_FRAME:
         return False
     sides = [in_frames(problem, arm, (alone.select(rows),)) for rows in (before, ~before)]
-    return all(side is not None and side.error <= largest_of(problem) for side in sides)
+    return all(side.error <= largest_of(problem) for side in sides)
 
 
 def unlike(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
@@ -125,7 +121,7 @@ def unlike(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
     Another device or session may have other units or conventions.
     """
     trials = [in_frames(problem, chain, (each,)) for each in sets] if len(sets) > 1 else []
-    errors = np.array([np.inf if trial is None else trial.error for trial in trials])
+    errors = np.array([trial.error for trial in trials])
     wrong = np.flatnonzero(errors > largest_of(problem)).tolist()
     worst = max(wrong or range(len(sets)), key=lambda k: len(sets[k]))
     if not 0 < len(wrong) < len(sets):
@@ -143,12 +139,10 @@ def among(sets: Sequence[Observations], one: Observations) -> str:
     return f'in the measurements {which} alone, '
 
 
-def _nearest(chain: Chain, each: Observations, arm: FloatArray, rows: Flags) -> Trial | None:
-    """Return the best closed form of some rows (N,), judged by all of them; None if none is."""
+def _nearest(chain: Chain, each: Observations, arm: FloatArray, rows: Flags) -> Trial:
+    """Return the best closed form of some rows (N,), judged by all of them."""
     starts = closed_forms(chain, each.select(rows), arm[rows])
-    found = [Trial(start, (each,), (arm,)) for start in starts]
-    found = [one for one in found if np.isfinite(one.error)]
-    return min(found, key=lambda one: one.error, default=None)
+    return min((Trial(s, (each,), (arm,)) for s in starts), key=lambda one: one.error)
 
 
 def refined(problem: Problem, trial: Trial) -> Trial:
