@@ -75,7 +75,7 @@ def test_workbooks(tmp_path, monkeypatch):
     sheet = book.create_sheet('measured')
     for row in (
         ['a title'],
-        NAMES,
+        [*NAMES, None, 'note'],
         ['rad', 'rad', 'm', 'm', 'm'],
         *np.column_stack([JOINTS, PLACES]).tolist(),
     ):
@@ -92,6 +92,7 @@ def test_workbooks(tmp_path, monkeypatch):
     found = read_table(path, 2, foreign=Foreign(Layout()))
     assert_same(found, None)
     assert 'there are no numbers in line 3: only units are read' in str(found.warnings)
+    assert 'columns not read: note ' in str(found.warnings)
     assert 'sheet "measured" of 2 is read (--sheet)' in str(found.warnings)
     book['first'].sheet_state = 'visible'
     book['first'].append(['a protocol', 1])
