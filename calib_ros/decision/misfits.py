@@ -4,10 +4,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
+from scipy import special
 
 from calib_ros.decision.drift import gain_of
 from calib_ros.decision.reasons import Reason, Rule
@@ -16,12 +19,13 @@ from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import stacked
-from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, TELLING
-from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING
+from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXCEPTION
 
 ADVICE = (
@@ -64,6 +68,42 @@ def arms_own(fitted: Fitted) -> str | None:
         if all_of_it > 10.0 * STILL and part < EXCEPTION * all_of_it:
             return f'{name} moves only in poses set aside as gross errors: {ADVICE}'
     return None
+
+
+def loose_target(sets: Sequence[Observations]) -> str:
+    """Return which of three or more targets moves against the others, whatever the arm does.
+
+    By the variance of their distances at the same configurations, without a tenth that may be
+    gross errors, against that of the steadiest pair.
+    """
+    places: list[dict[int, FloatArray]] = []
+    varies: dict[tuple[str, str, str], tuple[float, int]] = {}
+    for each, number in zip(sets, numbered(sets), strict=True):
+        points = each.distances is None and each.pixels is None and not each.inverse
+        places.append(dict(zip(number.tolist(), each.positions, strict=True)) if points else {})
+    for (one, its), (other, others) in combinations(zip(sets, places, strict=True), 2):
+        both = its.keys() & others.keys()
+        if one.base == other.base and one.tool != other.tool and len(both) >= TELLING:
+            apart = norms(np.array([its[k] - others[k] for k in both]))
+            off = np.sort(np.abs(apart - np.median(apart)))[: -int(EXCEPTION * len(both)) or None]
+            varies[one.tool, other.tool, one.base] = float(off @ off) / len(off), len(off)
+    least = min((variance for variance, _ in varies.values()), default=0.0)
+    chance = (1.0 - SURE) / max(len(varies) * (len(varies) - 1), 1)  # of one pair against another
+    wide = {
+        pair: variance
+        for pair, (variance, free) in varies.items()
+        if variance > least * max(special.fdtri(free, free, 1.0 - chance), 1.0 / NEARER)
+    }
+    if not wide:
+        return ''
+    (name, often), *_ = Counter(tool for pair in wide for tool in pair[:2]).most_common()
+    widest = max(wide, key=lambda pair: wide[pair])
+    which = name if often == len(wide) > 1 else f'{widest[0]} or {widest[1]}'
+    far, usual = (1e3 * np.sqrt(each) for each in (max(wide.values()), least))
+    return (
+        f'the target {which} is loose, or badly seen from some sides: its distance from another '
+        f'varies by {far:.2g} mm (RMS), {usual:.2g} mm is usual. Fasten it, or leave it out'
+    )
 
 
 def lacking(fitted: Fitted) -> float:

@@ -18,7 +18,7 @@ from scipy import special
 from calib_ros.decision.acceptance import out_of_scale
 from calib_ros.decision.delays import uneven
 from calib_ros.decision.lost_rows import computed_rows
-from calib_ros.decision.misfits import explained_share
+from calib_ros.decision.misfits import explained_share, loose_target
 from calib_ros.decision.printed_board import stretched
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.region import SHELL
@@ -80,7 +80,8 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
     level, other = _level(problem, result), _another_type(problem, result) if another else ''
     judged = _elsewhere(problem, result) if another else ''
-    found = (other, lens, board, judged, coupled, level, motion, _order(problem), sigmas)
+    loose, order = loose_target(problem.sets), _order(problem)
+    found = (other, lens, board, judged, coupled, level, loose, motion, order, sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
     return _lag(problem, replace(result, remarks=remarks, refusals=tuple(refusals)))
 

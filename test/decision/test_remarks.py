@@ -11,6 +11,7 @@ from fits import UR10E as UR
 
 from calib_ros.apply.simulation import measure
 from calib_ros.decision import plausibility
+from calib_ros.decision.misfits import loose_target
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import TELLING
@@ -33,6 +34,28 @@ def test_lengths_of_another_type_are_told(joint, off, unsearched):
     told = [each for each in result.remarks if 'is the chain that of' in each]
     assert bool(told) == (joint > 0 and off > 0.01)
     assert all(each.startswith(f'{name} further than 10 mm from nominal') for each in told)
+
+
+@pytest.mark.parametrize(
+    ('slack', 'gross', 'targets', 'told'),
+    [
+        (0.0, 2, 3, ''),
+        (4e-4, 0, 3, 'the target tool_1 is loose'),
+        (4e-4, 0, 2, ''),  # as if both were measured badly
+    ],
+)
+def test_a_target_that_is_loose_on_the_flange_is_told(slack, gross, targets, told, rng):
+    """It falls to one side where gravity pulls it there, whatever the arm does."""
+    q = UR.random_joints(25, rng)
+    poses, sets = UR.forward(q), []
+    for k, lever in enumerate(0.1 * np.eye(3)[:targets]):
+        place = lever + (k == 1) * slack * (poses[:, 2, :1] > 0.0) * [0.6, -0.8, 0.0]
+        seen = poses[:, :3, 3] + np.einsum('nij,nj->ni', poses[:, :3, :3], place)
+        seen += rng.normal(scale=5e-5, size=seen.shape)
+        seen[:gross] += 0.1 * k
+        sets.append(replace(Observations.from_arrays(q, seen), tool=f'tool_{k}'))
+    assert bool(found := loose_target(sets)) == bool(told)
+    assert found.startswith(told)
 
 
 @pytest.mark.parametrize(
@@ -204,7 +227,7 @@ class Judged:
         ({'sessions': 'two', 'lens': 'lens', 'given': 'gain'}, False, ['gain'], []),
         ({'given': 'mistake', 'sigmas': 's'}, False, ['mistake', 's'], []),
         ({'coupled': True, 'motion': 'fast', 'order': 'one way'}, True, [], ['fast', 'one way']),
-        ({'level': 'tool.z', 'motion': 'fast'}, True, [], ['tool.z', 'fast']),
+        ({'level': 'z', 'loose': '1', 'motion': 'fast'}, True, [], ['z', '1', 'fast']),
         ({'unseen': 'off', 'lens': 'lens'}, True, [], ['lens', 'off']),
         ({'unseen': 'off', 'given': 'mistake'}, False, ['mistake'], []),
         ({'type': 'joint_3.d', 'lens': 'lens'}, True, [], ['joint_3.d', 'lens']),
@@ -221,6 +244,7 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
         '_another_type': found.get('type', ''),
         '_level': found.get('level', ''),
         '_elsewhere': found.get('unseen', ''),
+        'loose_target': found.get('loose', ''),
         '_motion': found.get('motion', ''),
     }
     for name, part in parts.items():
