@@ -46,6 +46,7 @@ SIMULATION = f"""\
   --poses N=60  poses to measure
   --seed N=0  {SEED}
   --storage {'|'.join(STORAGES)}=mcap  storage format of the bag"""
+EYE = '  --eye-in-hand  poses or positions are of a fixed target, seen from the flange'
 MOVED = """\
   --new-base  the measuring device was moved
   --new-tool  the target was replaced or remounted"""
@@ -142,7 +143,7 @@ or .db3
   --csv FILE  a table, whatever its file name
   --chain! ROBOT  {CHAIN}
   --session NAME  only rows with this name in the column session; several joined by commas
-  --eye-in-hand  poses or positions are of a fixed target, seen from the flange
+{EYE}
   --largest-loss SHARE={EXCEPTION}  share of a bag's messages that may be lost or unused for \
 the result to be accepted; 1: any
   --sigma-touch M  standard deviation of heights over touched planes; default: 1e-4
@@ -207,6 +208,7 @@ what to judge
   --commanded FILE  the program before its correction, q1..qn: judge against the poses it \
 intends
   --session NAME  only rows with this name in the column session
+{EYE}
 {MOVED}
 how to judge
   --tolerance MM  wanted RMS position error; without it: does the calibration still hold?

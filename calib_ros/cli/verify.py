@@ -131,7 +131,8 @@ def _sets(
     kind = refuse_others(options.measured, 'verify', 'table', 'bag')
     common.refuse_ignored(options, kind)
     if kind == 'table':
-        found = inputs.table_of(options, options.measured, nominal, settings, screen)
+        given = options.measured, nominal, settings, screen, options.eye_in_hand
+        found = inputs.table_of(options, *given)
     else:
         session, read = inputs.replayed_bag(options.measured, nominal, settings, screen)
         screen.say(f'{read}; {session.account()}')

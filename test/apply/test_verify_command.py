@@ -122,6 +122,16 @@ def test_rows_marked_test_are_judged_like_others(cell, folder, run):
     assert found[1] == found[0]
 
 
+def test_a_table_of_a_camera_on_the_flange_is_read_as_by_identify(cell, folder, run):
+    q = UR.random_joints(60, np.random.default_rng(3))
+    for name, rows in (('fitted.csv', slice(40)), ('measured.csv', slice(40, None))):
+        inverted = measured(cell[0], q[rows], repeats=1).inverted()
+        write_csv(folder / name, rows_of(inverted, 0))
+    eye = ('--chain', 'ur10e', '--eye-in-hand')
+    assert run('identify', 'fitted.csv', *eye, '--out', 'seen')[0] == 0
+    assert run(*VERIFY, 'seen', '--tolerance', 1, '--eye-in-hand')[0] == 0
+
+
 def test_plan_writes_test_poses_that_are_seen(run, tmp_path):
     box = ('--box', 0.2, -0.5, 0.2, 1, 0.5, 1, '--tracker', 3, 0, 1)
     assert run('plan', '--chain', 'ur10e', '--iso9283', '--out', 'tests.csv', *box)[0] == 0
