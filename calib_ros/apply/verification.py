@@ -171,8 +171,8 @@ def verify(
     `tolerance`, the largest acceptable RMS position error [m], the verdict is whether the
     calibration holds, by `Calibration.limit`. `progress` receives the share done.
 
-    With `new_base` the measuring device was moved, with `new_tool` the target replaced or
-    remounted. Their frames are fitted, which absorbs the errors of two configurations and of one.
+    With `new_base` the measuring device was moved, with `new_tool` the target replaced. Fitting
+    their frames absorbs the errors of two configurations and of one (on the flange, one and two).
 
     `commanded` (M, n) are joint values [rad or m] of the uncorrected program: the nominal arm
     defines the wanted poses there. Each measurement belongs to one of them, as it is or corrected.
@@ -185,8 +185,7 @@ def verify(
     comparison, left, uncorrected, chain = _compared(arm, sets, commanded, fitted, group)
     progress(2 / 3)
     moments = moments_of(comparison.after.position, group) + SAME**2 * np.eye(3)  # without noise
-    seen = all(each.seen for each in sets)  # else turns of the base count, not those of the tool
-    lost = (IN_A_FRAME // 3 - seen) * new_base + (1 + seen) * new_tool
+    lost = new_base + new_tool + (new_tool if all(each.seen for each in sets) else new_base)
     rms, numbers, freedom, lower, upper = _interval(moments, lost, confidence, DECIDING)
     mistake = _mistake(arm, sets, rms, 1e-3 * (comparison.figures[1].rms_mrad or 0.0))
     reused, limit = arm.reused(sets), tolerance or arm.limit(sets)
