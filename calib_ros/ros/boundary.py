@@ -224,7 +224,7 @@ class DeferredTrigger:
 
 
 def run_node(make: Callable[[Collection[str]], Any], arguments: Sequence[str] | None) -> int:
-    """Run a node, made with `shared_names`, until SIGINT or SIGTERM; return the exit status.
+    """Run a node, made with `shared_names`, until a signal ends it; return the exit status.
 
     rclpy must not see the signals: its handler invalidates the context while messages are taken.
     """
@@ -282,5 +282,6 @@ def _spin(node: Any, executor: SingleThreadedExecutor, stop: threading.Event) ->
 
 
 def _handle_signals(handler: Any) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handler)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # by nohup
+            signal.signal(number, handler)

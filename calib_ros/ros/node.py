@@ -391,7 +391,7 @@ class CalibrationNode(Batched):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node until SIGINT or SIGTERM; return the exit status."""
+    """Run the node until a signal ends it; return the exit status."""
     return run_node(CalibrationNode, arguments)
 
 

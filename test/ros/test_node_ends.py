@@ -197,13 +197,13 @@ page.render = slow
 
 
 def test_ended_while_a_calibration_is_saved(journal):
-    """Its report was missing, and its thread could end in the middle of a file."""
+    """By a terminal that is closed: its thread could end in the middle of a file."""
     command = ('-c', SLOW_SAVE + NODE)
     with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
         cell.done('identify')
         cell.start_call('save')
         child.wait_for('rendering')
-        assert child.end(signal.SIGINT) == 0, child.output
+        assert child.end(signal.SIGHUP) == 0, child.output
     (path,) = journal.glob('*Z.html')
     said = f'~/save: saved to {path.with_suffix(".yaml")}, {path}'
     assert said in child.output
