@@ -229,9 +229,9 @@ class Archive:
         if self._journal is not None:
             self._journal.close()
             self._journal, self._written = None, []
-        elif not words and self.path in self._files(_JOURNAL, 0):  # as `begin` made it
+        elif not words and self.path in {*self._files(_JOURNAL, 0)} - {*self._files(_JOURNAL)}:
             with suppress(OSError):
-                self.path.unlink()
+                self.path.unlink()  # as `begin` made it
         return words
 
     def _new_path(self, ending: str) -> Path:

@@ -386,3 +386,15 @@ def test_a_journal_that_is_not_there_any_more_goes_on_in_another_file(tmp_path, 
     archive.close()
     if how == 'replaced':
         assert first.read_text() == 'by an editor'
+
+
+def test_a_journal_with_poses_is_not_removed_by_one_that_added_none(tmp_path):
+    archive, other = open_archive(tmp_path), open_archive(tmp_path, joints=('b', 'a'))
+    other.path = archive.path  # as two nodes at once choose it
+    archive.add(sample(1))
+    archive.close()
+    for _ in range(2):
+        other.close()
+        assert stamps(tmp_path) == [1]
+        with pytest.raises(InputError):
+            other.resume()
