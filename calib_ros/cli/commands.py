@@ -48,7 +48,7 @@ SIMULATION = f"""\
   --storage {'|'.join(STORAGES)}=mcap  storage format of the bag"""
 EYE = '  --eye-in-hand  poses or positions are of a fixed target, seen from the flange'
 MOVED = """\
-  --new-base  the measuring device was moved
+  --new-base  the measuring device, or what a camera on the flange sees, was moved
   --new-tool  the target was replaced or remounted"""
 LAYOUT = """\
 tables of other systems (docs/tables.md); anything not given is guessed
