@@ -184,7 +184,8 @@ def test_a_calibration_that_was_not_saved_is_told_of(journal):
 
 
 SLOW_SAVE = """
-import time
+import signal, time
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored below nohup
 from calib_ros.report import page
 from calib_ros.ros import node
 node.JOIN_TIMEOUT = 0.1
