@@ -93,7 +93,8 @@ class Archive:
 
     def begin(self) -> Path | None:
         """Show that a session begins, so that the journal before, returned, is not resumed."""
-        self.path.touch()
+        with suppress(OSError):  # told with the first pose
+            self.path.touch()
         return self.newest_journal()
 
     def add(self, sample: Sample) -> None:
