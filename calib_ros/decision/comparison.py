@@ -178,7 +178,7 @@ def axes_of(chain: Chain, observations: Observations) -> FloatArray:
     """Return the axes (N, 3, 3) of the arm's base in those of the residuals."""
     base = chain.frame(observations.base).matrix[:3, :3]
     if not observations.seen:
-        return np.tile(base, (len(observations), 1, 1))
+        return np.broadcast_to(base, (len(observations), 3, 3))
     seen = chain.forward(
         observations.joints, observations.approach, observations.base, observations.tool
     )

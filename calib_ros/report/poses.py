@@ -141,7 +141,7 @@ def _poses(
             first = rows.stop
             base, turn = chain.frame(each.base).matrix, axes_of(chain, each)
             reached = chain.forward(each.joints, each.approach, each.base, each.tool)
-            along = turn if each.distances is None else np.tile(np.eye(3), (len(each), 1, 1))
+            along = turn if each.distances is None else np.broadcast_to(np.eye(3), turn.shape)
             left = after.position[rows] if each.pixels is None else after.pixels[rows]
             left = left[:, :1] if each.distances is not None else left
             parts_in_sigma = samples.in_sigma(left, after.orientation[rows])
