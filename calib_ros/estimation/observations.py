@@ -202,10 +202,11 @@ class Observations(Shown):
         replace missing ones, because the uncertainty of the inverse includes the orientation's
         sigma times the distance. Positions alone become points in the frame of the camera.
         """
-        if self.distances is not None or self.oriented.any() > self.oriented.all():
+        mixed = self.oriented.any() > self.oriented.all()
+        if mixed or self.socket or self.distances is not None:
             raise InputError(
-                'a camera on the flange measures poses or positions, all with an orientation (qx '
-                'qy qz qw) or none'
+                'one camera on the flange measures either poses or positions, all with an '
+                'orientation (qx qy qz qw) or none: leave out the others, or name another device'
             )
         if not self.oriented.all():
             given, points = self.points, None

@@ -48,7 +48,7 @@ class Samples:
         self.count = len(observations)
         self.joints = np.ascontiguousarray(observations.joints.T)
         self.positions = np.ascontiguousarray(observations.positions.T)
-        self.seen = np.ascontiguousarray(observations.given.T) if observations.seen else None
+        self.points = np.ascontiguousarray(observations.given.T) if observations.seen else None
         approach = observations.approach
         self.approach = None if approach is None else np.ascontiguousarray(approach.T)
         self.distances = observations.distances
@@ -148,9 +148,9 @@ class Samples:
                 out = None  # the last is shorter
             approach = None if self.approach is None else self.approach[:, part]
             moving = None if velocity is None else velocity[:, part]
-            seen = None if self.seen is None else self.seen[:, part]
+            points = None if self.points is None else self.points[:, part]
             axes, origin, *found, phi = model.linearise(
-                joints[:, part], approach, moving, out, seen
+                joints[:, part], approach, moving, out, points
             )
             out = found[0], found[1]
             shift = found[0]
@@ -158,7 +158,7 @@ class Samples:
                 shift = _along(origin, shift, self.distances[part], self.observations.plane)
             else:
                 np.subtract(self.positions[:, part], origin, out=shift[-1])
-            if seen is not None:
+            if points is not None:
                 shift = np.einsum('kcb,pcb->pkb', axes, shift)
             weights = 1.0 if self.weights is None else self.weights[part]
             if not self.oriented and self.whitening is None:

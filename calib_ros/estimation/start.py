@@ -45,7 +45,7 @@ def start_frames(problem: Problem) -> Chain:
     """Return the model with base and tool frames that bring it close to the measurements.
 
     Sets with more equations come first, as one or two poses of a tool place no device; frames
-    found by them are kept. A point seen from the flange comes last, as it turns no base.
+    found by them are kept. A point seen from the flange turns no base: it follows sets that do.
     """
     chain, sigmas = problem.model, (problem.sigma_position, problem.sigma_orientation)
     found: set[str] = set()

@@ -271,9 +271,9 @@ def hashes(sets: Sequence[Observations]) -> Hashes:
     """Return a hash (N,) of the joint values and the measurement of each row."""
     found = [np.zeros(0, dtype=np.uint64)]
     for each in sets:
-        measured = each.positions
-        if each.points is not None:
-            measured = np.concatenate([x for x in (each.pixels, each.points) if x is not None], 1)
+        measured = each.given if each.seen else each.positions
+        if each.pixels is not None:
+            measured = np.concatenate([each.pixels, each.points], axis=1)
         elif each.distances is not None:
             measured = each.distances[:, np.newaxis]
         mixed = np.zeros(len(each), dtype=np.uint64)

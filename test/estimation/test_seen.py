@@ -157,7 +157,7 @@ def test_positions_are_turned_round_and_back(rng):
     assert not turned.inverted().seen
     some = replace(given, oriented=np.arange(5) > 2)
     far = replace(given, distances=np.ones(5))
-    for each in (some, far):
+    for each in (some, far, replace(given, socket=True)):
         with pytest.raises(InputError, match='all with an orientation'):
             each.inverted()
 
