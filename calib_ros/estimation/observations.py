@@ -205,8 +205,9 @@ class Observations(Shown):
         mixed = self.oriented.any() > self.oriented.all()
         if mixed or self.socket or self.distances is not None:
             raise InputError(
-                'one camera on the flange measures either poses or positions, all with an '
-                'orientation (qx qy qz qw) or none: leave out the others, or name another device'
+                'one camera on the flange measures either poses or positions, no distances or '
+                'sockets, all with an orientation (qx qy qz qw) or none: leave out the others, or '
+                'give them another device'
             )
         if not self.oriented.all():
             given, points = self.points, None
