@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sessions without a tracker, for `harm.py`: draw-wires, sockets, touched planes, a camera.
+"""Sessions without a tracker, for `harm.py`: draw-wires, sockets, touched planes, cameras.
 
 By the kinematics of `cell_simulator.py`; joint values that bring the target to a place follow from
 numeric derivatives. The camera (1280 x 720, focal length 900 px) sees 40 corners 30 mm apart from
@@ -108,6 +108,25 @@ def planes(arm, rng, count):
     return named(sets), {'sigma_touch': NOISE}
 
 
+def ball(arm, rng):
+    """Return 60 positions of a fixed ball seen by a 3D camera on the flange, 0.4 to 0.8 m away."""
+    while True:
+        home, place = place_of(arm, rng)
+        wanted = rng.uniform([-0.2, -0.2, 0.4], [0.2, 0.2, 0.8], (180, 3))
+        start = np.clip(home + rng.uniform(-1.5, 1.5, (180, len(home))), *arm.limits.T)
+        q = led(arm, start, lambda q, k, aim=place, w=wanted: toward(arm, q, aim) - w[k])
+        if len(q) >= 60:
+            break
+    seen = toward(arm, q[:60], place) + rng.normal(scale=NOISE, size=(60, 3))
+    return [Observations.from_arrays(q[:60], seen).inverted()], {'sigma_position': NOISE}
+
+
+def toward(arm, q, place):
+    """Return (N, 3) where the tool frame at joint values (N, n) has a place (3,)."""
+    turns, places = arm.forward(q)
+    return np.einsum('nji,nj->ni', turns, place - places)
+
+
 def projected(points):
     """Return pixels (..., 2) of points (..., 3) before the camera."""
     x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
@@ -158,6 +177,7 @@ SENSORS = {
     'sockets': lambda arm, rng, _: sockets(arm, rng, 4, False),
     'separations': lambda arm, rng, _: sockets(arm, rng, 4, True),
     'planes': lambda arm, rng, _: planes(arm, rng, 3),
+    'ball seen': lambda arm, rng, _: ball(arm, rng),
     'fixed camera': lambda arm, rng, larger: board(arm, rng, False, larger),
     'camera on the flange': lambda arm, rng, larger: board(arm, rng, True, larger),
 }
