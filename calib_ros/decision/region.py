@@ -246,7 +246,7 @@ class _Judge:
 
     def rows(self, joints: FloatArray) -> FloatArray:
         """Return the columns (K, 3, N) of the posterior's names, of others, and of waves."""
-        rows = self._model.shifts(joints)
+        rows = self._model.jacobian(joints)[:, :3].transpose(2, 1, 0)
         _, tilts = moved(self._model.chain, self._model.names, rows)
         return np.concatenate([rows, self._waves * waved(tilts, joints)])
 

@@ -94,8 +94,6 @@ class Aim:
         self._chain = chain
         self._model = ErrorModel(chain, [joint.driven for joint in chain.joints], base, tool)
         self._signs = np.array([float(joint.sign) for joint in chain.joints])[:, None, None]
-        kinds = [joint.type for joint in chain.joints]
-        self._turning = np.flatnonzero([kind == 'revolute' for kind in kinds])
 
     def linearise(
         self,
@@ -110,11 +108,10 @@ class Aim:
         At joint values (n, B), approached with signs (n, B), for wanted positions (3, B) [m] and
         axes (3, 3, B), whose first index counts them; a radian counts as `lever` [m].
         """
-        model, turning = self._model, self._turning
-        found, origin, shift, turn, _ = model.linearise(q, approach)
-        columns = np.zeros((len(q), 6, q.shape[1]))
-        columns[:, :3] = self._signs * shift[model.order]
-        columns[turning, 3:] = lever * self._signs[turning] * turn[model.order[turning]]
+        found, origin, *moved = self._model.linearise(q, approach)
+        columns = self._model.twists(*moved)
+        columns *= self._signs
+        columns[:, 3:] *= lever
         if self._chain.effects or self._chain.held:
             columns = np.einsum('jib,jkb->ikb', self._effects_slope(q), columns)
         turned = lever * orientation_error(axes, found) if lever else np.zeros_like(origin)

@@ -156,14 +156,6 @@ class ErrorModel:
             twists[:, :3] += se3.skew(places.T) @ twists[:, 3:]
         return np.ascontiguousarray(twists)
 
-    def shifts(self, q: FloatArray) -> FloatArray:
-        """Return the derivatives (P, 3, N) of the target's position alone at poses q (N, n)."""
-        rows = np.ascontiguousarray(self.chain.joint_values(q).T)
-        _, _, shift, _, phi = self.linearise(rows)
-        found = shift[self.order]
-        found[self.spread] *= phi[:, np.newaxis]
-        return found
-
     def twists(self, shift: FloatArray, turn: FloatArray, phi: FloatArray) -> FloatArray:
         """Return the derivatives (P, 6, B) by the named parameters from those of `linearise`."""
         found = np.zeros((len(self.names), 6, shift.shape[2]))
