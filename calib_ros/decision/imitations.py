@@ -27,17 +27,15 @@ LEAST = float(special.logit(SURE))
 class Imitation:
     """The arm's fit without a move, by products (P, P + 1) of its columns with all and residual.
 
-    `names` are those of the columns.
+    `names` are those of the columns: the fitted ones, then some held at nominal.
     """
 
     def __init__(self, fitted: Fitted, names: Sequence[str], products: FloatArray) -> None:
-        chain, model, known = fitted.chain, fitted.problem.model, fitted.problem.given
+        chain, known = fitted.chain, fitted.problem.given
         self._groups = [None if n in known else size_group(chain, n) for n in names]
         self._given = np.array([known.get(name, np.inf) for name in names]) ** -2.0
         self._frames = np.array([chain.owns_frame(name) for name in names])
-        self._offsets = np.array(
-            [0.0 if chain.owns_frame(n) else chain.offset(n, model) for n in names]
-        )
+        self._offsets = np.append(fitted.offsets, np.zeros(len(names) - len(fitted.names)))
         self._variance = max(fitted.size, ROUNDING) ** 2
         self._matrix, self._vector = self._about_nominal(products)
         typical = np.array([TYPICAL[g] if g else np.inf for g in self._groups])

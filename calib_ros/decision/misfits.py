@@ -22,7 +22,7 @@ from calib_ros.estimation.leastsquares import stacked
 from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS
+from calib_ros.estimation.robust import SUSPICIOUS
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray, norms
@@ -46,13 +46,12 @@ class Outlier:
 
 def outliers_of(fitted: Fitted) -> tuple[Outlier, ...]:
     """Return the samples that a robust fit excludes."""
-    if fitted.problem.loss == 'none':
-        return ()
-    sets = zip(fitted.problem.sets, fitted.robust.distances, strict=True)
+    robust = fitted.robust
+    sets = zip(fitted.problem.sets, robust.distances, robust.good, strict=True)
     return tuple(
         Outlier(number, k, int(each.stamps_ns[k]), float(distances[k]))
-        for number, (each, distances) in enumerate(sets)
-        for k in np.flatnonzero(distances > OUTLIER).tolist()
+        for number, (each, distances, good) in enumerate(sets)
+        for k in np.flatnonzero(~good).tolist()
     )
 
 

@@ -76,7 +76,7 @@ class Robust:
     @property
     def outliers(self) -> Flags:
         """Return which samples (N,) of all sets are gross errors."""
-        return (np.concatenate(self.distances) > OUTLIER) & (self.loss != 'none')
+        return ~np.concatenate(self.good)
 
 
 def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
