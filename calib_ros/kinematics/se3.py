@@ -9,6 +9,7 @@ radians. Transforms are homogeneous 4 x 4 matrices.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TypeAlias
 
 import numpy as np
@@ -45,25 +46,18 @@ def invert(matrix: FloatArray) -> FloatArray:
 
 def from_quat(quat_xyzw: FloatArray) -> FloatArray:
     """Turn (..., 4) quaternions, normalised here, into (..., 3, 3) rotation matrices."""
-    if not quat_xyzw.size:  # older versions of scipy refuse empty arrays
-        return np.zeros((*quat_xyzw.shape[:-1], 3, 3))
-    flat = Rotation.from_quat(_own(quat_xyzw, 4)).as_matrix()
-    return np.asarray(flat).reshape(*quat_xyzw.shape[:-1], 3, 3)
+    return _each(quat_xyzw, (4,), lambda flat: Rotation.from_quat(flat).as_matrix(), (3, 3))
 
 
 def to_quat(rotation: FloatArray) -> FloatArray:
     """Turn (..., 3, 3) rotation matrices into (..., 4) quaternions with w >= 0."""
-    if not rotation.size:
-        return np.zeros((*rotation.shape[:-2], 4))
-    quat = np.asarray(Rotation.from_matrix(_own(rotation, 3, 3)).as_quat())
-    quat = np.where(quat[:, 3:] < 0.0, -quat, quat)
-    return quat.reshape(*rotation.shape[:-2], 4)
+    quat = _each(rotation, (3, 3), lambda flat: Rotation.from_matrix(flat).as_quat(), (4,))
+    return np.where(quat[..., 3:] < 0.0, -quat, quat)
 
 
 def exp_rotation(vector: FloatArray) -> FloatArray:
     """Turn (..., 3) rotation vectors [rad] into (..., 3, 3) rotation matrices."""
-    flat = Rotation.from_rotvec(_own(vector, 3)).as_matrix()
-    return np.asarray(flat).reshape(*vector.shape[:-1], 3, 3)
+    return _each(vector, (3,), lambda flat: Rotation.from_rotvec(flat).as_matrix(), (3, 3))
 
 
 def turned(x: float, y: float, z: float) -> FloatArray:
@@ -93,10 +87,7 @@ def cos_sin(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def log_rotation(rotation: FloatArray) -> FloatArray:
     """Turn (..., 3, 3) rotation matrices into (..., 3) rotation vectors [rad]."""
-    if not rotation.size:
-        return np.zeros((*rotation.shape[:-2], 3))
-    flat = Rotation.from_matrix(_own(rotation, 3, 3)).as_rotvec()
-    return np.asarray(flat).reshape(*rotation.shape[:-2], 3)
+    return _each(rotation, (3, 3), lambda flat: Rotation.from_matrix(flat).as_rotvec(), (3,))
 
 
 def angles_between(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -143,6 +134,13 @@ def nearest_rotation(matrix: FloatArray) -> FloatArray:
     return np.asarray(u @ vt)
 
 
-def _own(array: FloatArray, *shape: int) -> FloatArray:
-    """Return a copy (N, *shape): scipy of Ubuntu 24.04 refuses read-only arrays."""
-    return np.array(array, dtype=np.float64).reshape(-1, *shape)
+def _each(
+    array: FloatArray,
+    shape: tuple[int, ...],
+    turned: Callable[[FloatArray], FloatArray],
+    into: tuple[int, ...],
+) -> FloatArray:
+    """Return (..., *into) of (..., *shape): old scipy refuses empty and read-only arrays."""
+    flat = np.array(array, dtype=np.float64).reshape(-1, *shape)
+    found = np.asarray(turned(flat)) if len(flat) else np.zeros(0)
+    return found.reshape(*array.shape[: array.ndim - len(shape)], *into)
