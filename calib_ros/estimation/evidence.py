@@ -186,7 +186,6 @@ def with_doubts(
     columns = _Columns(fitted, noise, more, rounding, posterior.unmodelled.waves)
     evidence, arm, considered = columns.evidence(), columns.arm, columns.considered
     size, slope = evidence.most_probable(considered)
-    matrix, vector = columns.about_nominal(columns.sums.reduced)
     near = evidence.near(size, slope)
     rival, scale, checked = None, 0.0, bool(fitted.problem.sigma_scale)
     if columns.scaled and fitted.held is None and (checked or columns.scale < PRINTED):
@@ -196,7 +195,7 @@ def with_doubts(
         odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
         rival, scale = (odds, mean[arm], covariance[arm, arm]), float(mean[-1])
     evidence.widen(size)
-    found = [(w, *solved(matrix, vector, evidence.precision(each))) for w, each in near]
+    found = [(w, *solved(*columns.normal, evidence.precision(each))) for w, each in near]
     doubted = [(w, mean[arm], root[arm] @ root[arm].T) for w, mean, root in found]
     if fitted.held is not None:  # nothing measures the scale
         doubted = [posterior.with_held(each, *fitted.held) for each in doubted]
@@ -232,23 +231,22 @@ class _Columns:
         self.scaled, count = bool(lengths), len(self.sums.plain) - 1
         self.arm = slice(0, count - self.scaled)  # with waves, in units of their size
         self.offsets = np.append(fitted.offsets, np.zeros(count - len(names)))
-        self._known: dict[str, float] = {**problem.given} | {**lenses(problem.model)}
-        self._checked = problem.sigma_scale
-        free = {size_group(self.chain, name) for name in names if name not in self._known}
-        self.considered = {size_group(self.chain, name) for name in more} - free
+        self.normal = self.about_nominal(self.sums.reduced)
+        known: dict[str, float] = {**problem.given} | {**lenses(problem.model)}
+        groups = [None if n in known else size_group(self.chain, n) for n in self.names]
+        self.considered = {*groups[len(names) :]} - {*groups[: len(names)]}
+        rest, self._checked = self.arm.stop - len(groups), problem.sigma_scale  # waves
+        self._groups = groups + [None] * rest
+        self._given = [known.get(name, np.inf) for name in self.names] + [1.0] * rest
 
     def evidence(self, scale: float | None = None) -> Evidence:
         """Return the evidence; with another usual `scale` of the device that nobody checked."""
         typical = TYPICAL | {'scale': self.scale if scale is None else scale}
-        groups = [None if n in self._known else size_group(self.chain, n) for n in self.names]
-        given = [self._known.get(name, np.inf) for name in self.names]
-        waves = self.arm.stop - len(groups)
-        groups, given = [*groups, *[None] * waves], [*given, *[1.0] * waves]
+        groups, given = self._groups, self._given
         if self.scaled:
             checked = scale is None and self._checked
             groups, given = [*groups, None if checked else 'scale'], [*given, checked or np.inf]
-        normal = self.about_nominal(self.sums.reduced)
-        return Evidence(*normal, np.array(given) ** -2.0, groups, typical)
+        return Evidence(*self.normal, np.array(given) ** -2.0, groups, typical)
 
     def about_nominal(self, products: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the normal equations (K, K), (K,) of all offsets from products of their rows."""
