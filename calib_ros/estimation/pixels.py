@@ -127,8 +127,6 @@ class PixelSamples(Samples):
         """
         found, _ = self.whitened_residuals(chain)
         yield found, slice(None)
-        if not self.count:
-            return
         length = np.linalg.norm(found, axis=1, keepdims=True)
         bounded = np.minimum(1.0, INNER * np.median(length) / np.maximum(length, 1e-300))
         sums = np.add.reduceat(found * bounded, self._begins)

@@ -319,7 +319,6 @@ def _need(names: Sequence[str], system: System) -> float:
     rows = sum(
         samples.rows / samples.count * (samples.observations.configurations.max() + 1)
         for samples in system.sets
-        if samples.count
     )
     return float(unknown(names, system) / rows)
 
@@ -341,7 +340,7 @@ class _Halves:
         rng = np.random.default_rng(0)
         masks = []
         for group in self._groups:
-            count = int(group.max(initial=-1)) + 1
+            count = int(group.max()) + 1
             rank = np.argsort(rng.random((STARTS, count)), axis=1)
             masks.append((rank < np.ceil(0.5 * need * count))[:, group])
         return np.concatenate(masks, axis=1)
@@ -350,9 +349,8 @@ class _Halves:
         """Return the samples with the shortest residuals, and the sums (S,) of their squares."""
         masks = np.zeros(squares.shape, dtype=bool)
         for part, size in zip(self.parts, self._sizes, strict=True):
-            if size:
-                index = np.argpartition(squares[:, part], size - 1, axis=1)[:, :size]
-                np.put_along_axis(masks[:, part], index, True, axis=1)
+            index = np.argpartition(squares[:, part], size - 1, axis=1)[:, :size]
+            np.put_along_axis(masks[:, part], index, True, axis=1)
         return masks, (squares * masks).sum(axis=1)
 
 
