@@ -211,15 +211,6 @@ def test_held_out_poses_have_frames_too(rng):
     assert result.validation.figures[1].max_mm < 0.5
 
 
-@pytest.mark.parametrize('field', ['distances', 'approach'])
-def test_measurements_that_are_no_numbers_are_refused(field, rng):
-    seen = between(faulty(UR10E, Cell(), rng), 5, rng)
-    values = np.zeros(5) if field == 'distances' else np.zeros((5, 6))
-    values[3] = np.nan
-    with pytest.raises(InputError, match=field):
-        replace(seen, **{field: values})
-
-
 @pytest.mark.parametrize('unit', [1e3, 1e2, 1.0 / 0.0254])
 def test_distances_that_no_arm_moves_by_are_no_metres(rng, unit):
     """Told before a fit that would not end: it took minutes, and named a moved device."""
