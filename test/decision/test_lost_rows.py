@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, UR10E, arm
+from fits import NOISE, UR10E, arm, measured_arm
 from scipy.spatial.transform import Rotation
 
 from calib_ros import Problem, identify
@@ -21,11 +21,6 @@ from calib_ros.estimation.levels import LEAST_ASIDE
 from calib_ros.kinematics.chain_file import load_chain
 
 
-def seen_of(count, oriented):
-    rng = np.random.default_rng(1)
-    return measure(arm(rng), UR10E.random_joints(count, rng), rng, *NOISE, oriented)
-
-
 @pytest.mark.parametrize(
     ('positions', 'joints', 'said'),
     [
@@ -37,7 +32,7 @@ def seen_of(count, oriented):
 @pytest.mark.parametrize('oriented', [True, False])
 def test_rows_lost_in_one_of_two_tables_are_named(positions, joints, said, oriented):
     """Joint values and measurements were put side by side, row by row."""
-    seen = seen_of(40, oriented)
+    *_, seen = measured_arm(1, 40, oriented=oriented)
     measured = seen.select(np.delete(np.arange(len(seen)), positions))
     kept = np.delete(seen.joints, joints, axis=0)
     result = identify(Problem(UR10E, replace(measured, joints=kept)))
@@ -47,7 +42,7 @@ def test_rows_lost_in_one_of_two_tables_are_named(positions, joints, said, orien
 
 @pytest.mark.parametrize(('row', 'told'), [(20, True), (30, False)])
 def test_the_error_once_corrected_tells_nothing_where_most_rows_are_right(row, told):
-    seen = seen_of(40, False)
+    *_, seen = measured_arm(1, 40, oriented=False)
     kept = replace(seen.select(np.delete(np.arange(40), [row, 39])), joints=seen.joints[:-2])
     found = explained(Problem(UR10E, kept))
     assert f'from line {row + 2} on' in found.suspects[0].what
@@ -60,7 +55,7 @@ def test_the_error_once_corrected_tells_nothing_where_most_rows_are_right(row, t
 def test_a_loss_is_sought_in_tables_of_so_many_rows(fewest, most, told, monkeypatch):
     monkeypatch.setattr(lost_rows, 'FEWEST_ROWS', fewest)
     monkeypatch.setattr(lost_rows, 'MOST_SEARCHED', most)
-    seen = seen_of(40, False)
+    *_, seen = measured_arm(1, 40, oriented=False)
     kept = replace(seen.select(np.delete(np.arange(40), [20, 39])), joints=seen.joints[:-2])
     found = row_loss(Problem(UR10E, kept), UR10E, kept, 5e-3)
     assert (found is not None) == told
@@ -68,7 +63,7 @@ def test_a_loss_is_sought_in_tables_of_so_many_rows(fewest, most, told, monkeypa
 
 def test_rows_lost_before_the_first_and_again_later_are_not_told_as_one():
     """Corrected as told, the first half would still stand one row off."""
-    seen = seen_of(40, False)
+    *_, seen = measured_arm(1, 40, oriented=False)
     rows = np.delete(np.arange(40), [0, 20])
     shifted = replace(seen.select(rows), joints=seen.joints[:-2])
     assert row_loss(Problem(UR10E, shifted), UR10E, shifted, 5e-3) is None
@@ -127,7 +122,7 @@ def test_any_order_of_the_joints_is_named(name, oriented):
 )
 def test_a_source_that_repeats_its_last_value_is_named(part, rows_of):
     """If the other rows do not suffice; a fixed point touched again and again is measured so."""
-    seen, rows = seen_of(40, True), slice(8, 30)
+    (*_, seen), rows = measured_arm(1, 40), slice(8, 30)
     held = {'joints': seen.joints.copy()}
     if part != 'joint values are':
         held = {'positions': seen.positions.copy(), 'rotations': seen.rotations.copy()}
@@ -142,7 +137,7 @@ def test_a_source_that_repeats_its_last_value_is_named(part, rows_of):
 
 @pytest.mark.parametrize('size', [1e3, 1e-3])
 def test_one_coordinate_in_another_unit_is_named(size):
-    seen = seen_of(30, size > 1.0)
+    *_, seen = measured_arm(1, 30, oriented=size > 1.0)
     positions = seen.positions * [1.0, size, 1.0]
     found = explained(Problem(UR10E, replace(seen, positions=positions)))
     assert found.suspects[0].remedy == f'--columns y=y*{1.0 / size:g}'
@@ -152,20 +147,20 @@ def test_one_coordinate_in_another_unit_is_named(size):
     ('axes', 'option'), [([1, 0, 2], 'x=y,y=x,z=z'), ([2, 1, 0], 'x=z,y=y,z=x')]
 )
 def test_coordinates_of_the_positions_alone_in_another_order_are_named(axes, option):
-    seen = seen_of(30, True)
+    *_, seen = measured_arm(1, 30)
     found = explained(Problem(UR10E, replace(seen, positions=seen.positions[:, axes])))
     assert f'--columns {option}' in [each.remedy for each in found.suspects]
 
 
 def test_a_coordinate_of_the_positions_alone_that_counts_the_other_way_is_named():
-    seen = seen_of(30, True)
+    *_, seen = measured_arm(1, 30)
     found = explained(Problem(UR10E, replace(seen, positions=seen.positions * [1.0, 1.0, -1.0])))
     assert [each.remedy for each in found.suspects] == ['--columns x=x,y=y,z=-z']
 
 
 def test_euler_angles_about_fixed_axes_in_the_order_of_their_columns_are_named():
     """Of a Fanuc, W P R, read as those of a KUKA, A B C."""
-    seen = seen_of(30, True)
+    *_, seen = measured_arm(1, 30)
     angles = Rotation.from_matrix(seen.rotations).as_euler('xyz')
     wrong = Rotation.from_euler('ZYX', angles).as_matrix()
     (found,) = explained(Problem(UR10E, replace(seen, rotations=wrong))).suspects
@@ -176,9 +171,7 @@ def test_euler_angles_about_fixed_axes_in_the_order_of_their_columns_are_named()
 @pytest.mark.parametrize('zero', [0.0, 0.005, 0.1, -0.1])
 def test_the_zero_of_a_draw_wire_is_named(zero, effects):
     """5 mm of it were accepted, and left the arm 0.8 mm off."""
-    rng = np.random.default_rng(21)
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(80, rng), rng, 3e-5, oriented=False)
+    *_, seen = measured_arm(21, 80, (3e-5, 0.0), oriented=False)
     lengths = np.linalg.norm(seen.positions, axis=1) + zero
     result = identify(Problem(UR10E, replace(seen, distances=lengths), effects=effects))
     way = 'long' if zero > 0.0 else 'short'
@@ -230,8 +223,7 @@ def test_nominal_poses_among_measured_ones_are_named(order, oriented):
 
 def test_rows_beside_others_that_no_arm_explains_are_not_nominal():
     """Their joint values are of other moments, say; the arm's errors are not seen beside these."""
-    rng = np.random.default_rng(3)
-    seen = measure(arm(rng), UR10E.random_joints(60, rng), rng, *NOISE)
+    rng, _, seen = measured_arm(3, 60)
     seen.positions[20:] += rng.normal(scale=0.5, size=(40, 3))
     assert not lost_rows.computed_rows(Problem(UR10E, seen))
 

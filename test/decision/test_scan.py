@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, arm
+from fits import NOISE, SIGMAS, UR10E, arm, measured_arm
 
 from calib_ros import Problem
 from calib_ros.apply.simulation import measure
@@ -51,8 +51,7 @@ def test_a_step_between_places_of_the_coarse_search_may_explain_just_enough(monk
 
 
 def test_a_held_frame_that_does_not_explain_most_is_not_named(monkeypatch, rng):
-    true = arm(rng)
-    seen = measure(true, UR10E.random_joints(COUNT, rng), rng, *NOISE)
+    _, true, seen = measured_arm(rng, COUNT)
     matrix = true.base.matrix + 3e-3 * np.eye(4, k=3)
     chain = replace(UR10E, base=replace(true.base, matrix=matrix, fixed=True))
     fitted = fitting.fit(Problem(chain, seen, **SIGMAS))[2]

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import fits
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, along_path, at_stations
+from fits import NOISE, SIGMAS, UR10E, along_path, at_stations, measured_arm
 
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -108,9 +108,7 @@ def test_a_step_is_named_and_refused(design, what, size, unmodelled):
 
 
 def test_a_step_of_simulated_measurements_without_noise_is_all_that_is_left():
-    rng = np.random.default_rng(0)
-    true = arm(rng)
-    seen = measure(true, UR10E.random_joints(COUNT, rng), rng, 0.0, 0.0)
+    _, true, seen = measured_arm(0, COUNT, (0.0, 0.0))
     step = identify(Problem(UR10E, moved(seen, true, 'tool', 1e-3), **SIGMAS)).step
     assert (step.what, step.sample) == ('tool', AT)
     assert step.share == pytest.approx(1.0)
@@ -170,9 +168,7 @@ def test_what_follows_the_joints_is_no_step(design, count):
 def test_a_dozen_positions_show_a_bump_and_nothing_else():
     """A step of the base may spare priors more squares than nine degrees of freedom leave."""
     for seed in (2, 3, 16, 18, 24):
-        rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        seen = measure(true, UR10E.random_joints(12, rng), rng, *NOISE, oriented=False)
+        _, true, seen = measured_arm(seed, 12, oriented=False)
         assert identify(Problem(UR10E, seen, **SIGMAS)).step is None
         bumped = Problem(UR10E, moved(seen, true, 'tool', 5e-3, at=6), **SIGMAS)
         assert abs(find_step(fitting.fit(bumped)[2]).sample - 6) <= 1
