@@ -329,10 +329,8 @@ def without_each(
     rest = parts.sum(axis=0) + extra.T @ extra - parts
     for k, normal in enumerate(rest):
         step = _solve(normal[:-1, :-1], normal[:-1, -1])
-        near = chain
-        if np.isfinite(step).all():
-            near = chain.with_offsets(dict(zip(names, step, strict=True)))
-        if not np.abs(step[curved]).max(initial=0.0) <= SMALL_STEP:
+        near = chain.with_offsets(dict(zip(names, step, strict=True)))
+        if np.abs(step[curved]).max(initial=0.0) > SMALL_STEP:
             few = system.select([numbers != k for numbers in folds])
             near = minimise(near, names, few, tolerance=1e-3).chain
         yield near
