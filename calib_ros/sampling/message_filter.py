@@ -249,7 +249,7 @@ class MessageFilter:
         return part if good.all() else part.rows(good)
 
     def _joints(self, parts: Sequence[Part], recording: bool) -> Iterator[Piece]:
-        latest = -1
+        latest, good = -1, False
         for part in parts:
             places, _, (_, *names), stamps, numbers = part
             self._names.hear(names, numbers)
@@ -267,8 +267,8 @@ class MessageFilter:
             places, *_, stamps, values = self._usable(part._replace(numbers=values))
             if not len(stamps):
                 continue
+            good = True
             self.received[JOINTS] += len(stamps)
-            self.refused.pop(JOINTS, None)
             if len(columns) == self._joint_count and places[-1] > latest:
                 latest = int(places[-1])
                 self.latest = (int(stamps[-1]), values[-1].tolist())
@@ -276,6 +276,8 @@ class MessageFilter:
                 yield Piece(columns, places, stamps, values)
             else:
                 self.unused['joints: not recording'] += len(stamps)
+        if good:  # others among them are only counted
+            self.refused.pop(JOINTS, None)
 
     def _measured(self, parts: Sequence[Part], recording: bool) -> Iterator[Piece]:
         for part in self._by_frame(parts):

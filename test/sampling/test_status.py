@@ -208,6 +208,8 @@ def test_a_joint_that_is_named_twice_has_no_value():
     assert made.account().dropped == {'joints: a joint is named twice': 1}
     others = (*UR5E.joint_names, 'finger', 'finger')  # not ours to judge
     assert named((others, [0.1] * 8)).account().dropped == {}
+    mixed = named((UR5E.joint_names, [0.1] * 6), (twice, [0.1] * 6 + [0.2]))
+    assert 'refused' not in mixed.status()  # "nothing can be sampled" while poses came
 
 
 def test_what_was_heard_is_remembered_however_the_names_are_arranged(rng):
