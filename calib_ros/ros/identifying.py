@@ -130,7 +130,7 @@ class Identifying:
             problem = session.problem()
         except InputError as err:
             why = [] if session.samples else inputs.failures
-            told = InputError('; '.join((*why, str(err))))
+            self._advice, told = '; '.join(why), InputError('; '.join((*why, str(err))))
             self._failed(told)
             raise told from err
         samples = tuple(session.usable)

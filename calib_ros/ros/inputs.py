@@ -30,7 +30,7 @@ from rclpy.waitable import Waitable
 
 from calib_ros.errors import ConfigError
 from calib_ros.sampling.batches import BATCH, Stream, links_of
-from calib_ros.sampling.messages import CAMERA_INFO, PICTURES
+from calib_ros.sampling.messages import CAMERA_INFO, PICTURES, short_type
 from calib_ros.sampling.slices import NO_ACCIDENT, SILENCE
 from calib_ros.settings import EXCEPTION
 
@@ -254,10 +254,11 @@ class Inputs:
             for info in self._node.get_publishers_info_by_topic(topic):
                 offered, how = info.qos_profile, ''
                 if info.topic_type != stream.type:
-                    how = f'as {info.topic_type}, not as {stream.type}'
+                    how = f'as {info.topic_type}, not as {short_type(stream.type)}'
+                    how += ': set type in sources' if stream.source else ''
                 elif (asked.reliability, offered.reliability) == (RELIABLE, BEST_EFFORT):
-                    setting = f'qos_overrides.{topic}.subscription.reliability'
-                    how = f'best effort, but reliable is asked for: set {setting} to best_effort'
+                    ask = 'set its qos_overrides to best_effort'
+                    how = f'best effort, but heard as reliable: {ask}'
                 elif (asked.durability, offered.durability) == (TRANSIENT_LOCAL, VOLATILE):
                     how = 'not latched, but that is asked for: make it transient local'
                 if how:

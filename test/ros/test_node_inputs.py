@@ -27,11 +27,12 @@ def test_an_overridden_qos(tmp_path, recording):
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
         deaf = cell.peer.create_publisher(JointState, 'joint_states', BEST_EFFORT)
         said = (
-            '/joint_states is published best effort, but reliable is asked for: '
-            'set qos_overrides./joint_states.subscription.reliability to best_effort'
+            '/joint_states is published best effort, but heard as reliable: '
+            'set its qos_overrides to best_effort'
         )
         cell.spin_until(lambda: heard and said in heard[-1].status[0].message)
         assert heard[-1].status[0].level == DiagnosticStatus.WARN
+        assert cell.refused('identify').message.startswith(f'{said} ... full text: ')
         for topic, policy in (
             ('/joint_states', ReliabilityPolicy.RELIABLE),
             ('/measured_pose', ReliabilityPolicy.BEST_EFFORT),
@@ -54,12 +55,14 @@ def test_a_topic_of_another_type_is_told(cell):
     rclpy.init(context=context, args=[], domain_id=cell.domain)
     other = Node('other', context=context)
     other.create_publisher(PointStamped, 'measured_pose', 10)
-    said = '/measured_pose is published as geometry_msgs/msg/PointStamped, not as'
+    said = '/measured_pose is published as geometry_msgs/msg/PointStamped, not as PoseStamped'
     status = cell.listen(String, 'calibration_node/status')
     cell.spin_until(lambda: heard and said in heard[-1].status[0].message)
     assert heard[-1].status[0].level == DiagnosticStatus.WARN
     cell.spin_until(lambda: status and said in status[-1].data)  # the operator reads no other
-    assert said in cell.in_full(cell.refused('identify'))
+    answer = cell.refused('identify')
+    assert answer.message.startswith(f'{said}: set type in sources ... full text: ')
+    assert 'no poses to fit' in cell.in_full(answer)
     other.destroy_node()
     cell.spin_until(lambda: said not in heard[-1].status[0].message)
     context.try_shutdown()
