@@ -115,6 +115,8 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
                 break
         else:
             came = f'no robot_description arrived within {DESCRIPTION_WAIT:g} s'
+            if node.count_publishers(topic):
+                came += f' from the publisher of {topic}, which must latch it (transient local)'
             raise ConfigError(f'{came}: start robot_state_publisher, or set chain to a file')
         text = message.data
     elif Path(name).suffix.lower() in URDF_SUFFIXES:

@@ -70,6 +70,11 @@ def test_a_description_that_does_not_come_is_missed(tmp_path, monkeypatch):
         told = cell.log()
         with pytest.raises(ConfigError, match='no robot_description arrived within'):
             cell.start(['__ns:=/cell_2'], chain='robot_description', data_dir=str(tmp_path))
+        cell.peer.create_publisher(String, '/robot_description', 1)
+        with pytest.raises(
+            ConfigError, match='publisher of /robot_description, which must latch it'
+        ):
+            cell.start(chain='robot_description', data_dir=str(tmp_path))
         said = 'waiting up to 0.2 s for /cell_2/robot_description'
         cell.spin_until(lambda: said in [each.msg for each in told])
 
