@@ -26,10 +26,15 @@ class Broadcast:
     """
 
     def __init__(self, node: Node, given: Given, urdf: str) -> None:
-        self._node, self._given = node, given
-        self._publisher = None
+        self._node, self._publisher = node, None
+        self._names = given.base_frame, given.flange_frame, given.target_frame
         if not given.base_frame and not given.flange_frame:
             return
+        if len({*self._names}) < len(self._names):
+            raise ConfigError(
+                'base_frame, flange_frame and target_frame must be three different names, not '
+                f'{", ".join(self._names)}'
+            )
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError as err:
@@ -47,22 +52,19 @@ class Broadcast:
         """Publish the frames of a calibrated chain measured in the frame `world`."""
         if self._publisher is None:
             return
-        given, transforms = self._given, []
-        target = given.target_frame
+        base, flange, target = self._names
         stands, moves = (target, world) if in_hand else (world, target)
-        if not world:
-            self._node.get_logger().warning('the measurements name no frame: /tf_static lacks it')
-        for name in {given.base_frame, given.flange_frame} & {stands, moves} - {''}:
+        found = [
+            (stands, base, chain.frame('base').matrix @ se3.invert(self._base)),
+            (flange, moves, se3.invert(self._tool) @ chain.frame('tool').matrix),
+        ]
+        if world in ('', *self._names):  # a loop, or two parents of one frame
+            found = [] if world == target else [found[not in_hand]]
             self._node.get_logger().warning(
-                f'"{name}" is the frame of what is measured, too: /tf_static lacks it; name '
-                'base_frame, flange_frame and target_frame otherwise'
+                f'the measurements come in frame "{world}": /tf_static lacks it; give it a name '
+                'other than base_frame, flange_frame and target_frame'
             )
-        if given.base_frame and stands not in ('', given.base_frame):
-            base = chain.frame('base').matrix @ se3.invert(self._base)
-            transforms.append(self._transform(stands, given.base_frame, base))
-        if given.flange_frame and moves not in ('', given.flange_frame):
-            tool = se3.invert(self._tool) @ chain.frame('tool').matrix
-            transforms.append(self._transform(given.flange_frame, moves, tool))
+        transforms = [self._transform(*each) for each in found if all(each[:2])]
         self._publisher.publish(self._type(transforms=transforms))
 
     def _transform(self, parent: str, child: str, matrix: FloatArray) -> TransformStamped:

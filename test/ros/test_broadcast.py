@@ -93,10 +93,15 @@ def test_a_camera_on_the_flange_sees_a_target_that_stands():
 
 
 def test_frames_without_a_name_of_their_own_are_left_out():
-    """A frame that is its own parent would be an error in every listener."""
+    """A frame that is its own parent, or has two, would be an error in every listener."""
     chain = true_arm()
+    assert set(broadcast(chain, world='tool0')) == {('tool0', 'ball')}
+    assert set(broadcast(chain, 'base_link', in_hand=True)) == {('ball', 'base_link')}
+    assert set(broadcast(chain, 'ball')) == set()
     assert set(broadcast(chain, world='base_link')) == {('tool0', 'ball')}
     assert set(broadcast(chain, 'tool0', in_hand=True)) == {('ball', 'base_link')}
     assert set(broadcast(chain, base_frame='')) == {('tool0', 'ball')}
     assert set(broadcast(chain, flange_frame='')) == {('leica', 'base_link')}
     assert set(broadcast(chain, world='')) == {('tool0', 'ball')}
+    with pytest.raises(ConfigError, match='three different names, not tool0, tool0, ball'):
+        broadcast(chain, base_frame='tool0')
