@@ -31,10 +31,8 @@ class Broadcast:
         if not given.base_frame and not given.flange_frame:
             return
         if len({*self._names}) < len(self._names):
-            raise ConfigError(
-                'base_frame, flange_frame and target_frame must be three different names, not '
-                f'{", ".join(self._names)}'
-            )
+            names = 'base_frame, flange_frame and target_frame'
+            raise ConfigError(f'{names} must be different, not {", ".join(self._names)}')
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError as err:

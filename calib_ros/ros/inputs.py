@@ -257,8 +257,7 @@ class Inputs:
                     how = f'as {info.topic_type}, not as {short_type(stream.type)}'
                     how += ': set type in sources' if stream.source else ''
                 elif (asked.reliability, offered.reliability) == (RELIABLE, BEST_EFFORT):
-                    ask = 'set its qos_overrides to best_effort'
-                    how = f'best effort, but heard as reliable: {ask}'
+                    how = 'best effort, but heard as reliable: set qos_overrides to best_effort'
                 elif (asked.durability, offered.durability) == (TRANSIENT_LOCAL, VOLATILE):
                     how = 'not latched, but that is asked for: make it transient local'
                 if how:

@@ -17,7 +17,6 @@ from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import String
 
@@ -26,6 +25,8 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, chain_text, load_chain
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.ros.arguments import PARAMETERS, NodeParameter
+from calib_ros.ros.to_ros import LATCHED
+from calib_ros.sampling.sample import socket_place
 from calib_ros.sampling.slices import SILENCE
 from calib_ros.settings import Settings
 from calib_ros.shown import some
@@ -74,10 +75,9 @@ def declare_all(node: Node, shared: Collection[str]) -> tuple[Given, Sequence[st
             '--ros-args -p chain:=ur10e; in a parameter file under the key /**'
         )
     if not own['target_frame']:
-        raise ConfigError(
-            'parameter "target_frame" must not be empty: it is the frame of what a camera on the '
-            'flange measures; name it, or leave it out'
-        )
+        raise ConfigError('parameter "target_frame" must not be empty: name it, or leave it out')
+    if own['socket']:
+        socket_place(own['socket'])
     return Given(**own, settings=settings), [*overrides]
 
 
@@ -100,16 +100,12 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
     """Return the nominal chain, and its URDF if it comes from one."""
     name, links = os.path.expanduser(given.chain), given.links
     if name == 'robot_description':
-        qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        step = DESCRIPTION_WAIT / 10
         topic = node.resolve_topic_name('robot_description')
         node.get_logger().info(f'waiting up to {DESCRIPTION_WAIT:g} s for {topic}')
         for _ in range(10):  # between them a signal is heard
             found, message = wait_for_message(
-                String,
-                node,
-                'robot_description',
-                qos_profile=qos,
-                time_to_wait=DESCRIPTION_WAIT / 10,
+                String, node, 'robot_description', qos_profile=LATCHED, time_to_wait=step
             )
             if found:
                 break

@@ -28,7 +28,7 @@ def test_an_overridden_qos(tmp_path, recording):
         deaf = cell.peer.create_publisher(JointState, 'joint_states', BEST_EFFORT)
         said = (
             '/joint_states is published best effort, but heard as reliable: '
-            'set its qos_overrides to best_effort'
+            'set qos_overrides to best_effort'
         )
         cell.spin_until(lambda: heard and said in heard[-1].status[0].message)
         assert heard[-1].status[0].level == DiagnosticStatus.WARN

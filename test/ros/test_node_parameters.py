@@ -152,6 +152,7 @@ def test_all_of_an_atomic_change_or_nothing(idle):
         ({'shortest_stop': 6.0}, 'shortest_stop (6 s) must be shorter than longest_stop (5 s)'),
         ({'tip_link': 'tool0'}, 'apply only to a URDF'),
         ({'history': 'history'}, 'set serial as well'),
+        ({'socket': 'A'}, 'socket must be LOCATION/SOCKET (A/1)'),
         ({'data_dir': '~nobody-here/x'}, 'no such home folder'),
         ({'candidates': '~nobody-here/x'}, 'no such home folder'),
         ({'target_filename': '/x.yaml'}, 'choose target_filename in data_dir, or start'),
