@@ -65,6 +65,8 @@ class Diagnostics:
     def _judged(self, account: Account) -> tuple[bytes, str]:
         unloaded = '' if self._session.calibration else self.unloaded
         wrong = [*filter(None, [unloaded]), *self._namesakes(), *self._inputs.troubles()]
+        if not self._node.get_clock().now().nanoseconds:
+            wrong.append('use_sim_time is set, but /clock gives no time: published stamps are 0')
         before, self._dropped_before = self._dropped_before, account.dropped
         fresh = [cause for cause, count in account.dropped.items() if count > before.get(cause, 0)]
         if fresh:

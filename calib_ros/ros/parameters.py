@@ -60,8 +60,7 @@ def declare_all(node: Node, shared: Collection[str]) -> tuple[Given, Sequence[st
     overrides = {name: each.value for name, each in given if not name.startswith(OF_ROS)}
     for name in overrides:
         node.undeclare_parameter(name)
-    ours = (each for each in PARAMETERS.values() if each.name not in OF_ROS)
-    own = {each.name: _declare(node, overrides, each) for each in ours}
+    own = {n: _declare(node, overrides, p) for n, p in PARAMETERS.items() if n not in OF_ROS}
     strange = [each for each in overrides if each in shared and not _is_ours(each)]
     if strange:
         told = f'parameters of all nodes that this one does not have: {", ".join(some(strange))}'

@@ -91,8 +91,7 @@ def apart(ahead: float) -> Hint:
         f'measurements were stamped {abs(ahead):.1f} s {when} the newest joint state{late}: '
         'synchronise the clocks (NTP, PTP) and repeat the poses of that time'
     )
-    status = f'stamps disagree by {abs(ahead):.1f} s: synchronise the clocks{instead}'
-    return Hint(status, words)
+    return Hint(f'stamps disagree by {abs(ahead):.1f} s: synchronise the clocks{instead}', words)
 
 
 def ended(seconds: float) -> Hint:

@@ -192,10 +192,13 @@ def test_stamps_follow_simulated_time(tmp_path):
         diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
         cell.spin_until(lambda: diagnostics)  # it speaks although the clock stands still
         assert stamp_ns(diagnostics[0]) == 0
+        said = 'use_sim_time is set, but /clock gives no time'
+        cell.spin_until(lambda: said in diagnostics[-1].status[0].message)
         clock = cell.publisher(Clock, '/clock')
         for seconds in (1000, 2000, 500):  # and when it jumps back
             clock.publish(Clock(clock=Time(sec=seconds)))
             cell.spin_until(lambda now=seconds: stamp_ns(diagnostics[-1]) == now * 10**9)
+        cell.spin_until(lambda: said not in diagnostics[-1].status[0].message)
         cell.set_parameters({'use_sim_time': False})
         cell.spin_until(lambda: stamp_ns(diagnostics[-1]) > 10**18)
 
