@@ -38,6 +38,7 @@ from calib_ros.apply.design import (
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.identifiability import independent, indices_of
+from calib_ros.kinematics.inverse import check_limits
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Criterion
@@ -261,12 +262,14 @@ def plan(
     two poses differ by at least `apart` [rad or m] in the joint that moves most. `chosen` (count,)
     are indices already found.
 
-    Raises InputError if the candidates do not suffice, ConfigError for a count below one or rates
-    that are not positive.
+    Raises InputError if the candidates do not suffice or joint values are beyond their limits,
+    ConfigError for a count below one or rates that are not positive.
     """
     candidates, task = map(design.chain.joint_values, (candidates, task))
     if not len(candidates) or not len(task):
         raise InputError('a plan needs candidates, and at least one pose of the task')
+    check_limits(candidates, design.chain, lambda k, i: f'candidates[{k}, {i}]: ')
+    check_limits(task, design.chain, lambda k, i: f'task[{k}, {i}]: ')
     joints = candidates.shape[1]
     speeds = np.ones(joints) if velocities is None else velocities
     if speeds.shape != (joints,) or not (speeds > 0.0).all():

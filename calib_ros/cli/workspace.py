@@ -13,9 +13,10 @@ from calib_ros.apply.workspace import Survey, in_base, regions, task_of
 from calib_ros.cli import common, inputs
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-from calib_ros.files.programs import check_limits, csv_of, joints_csv, read_poses
+from calib_ros.files.programs import csv_of, joints_csv, read_poses
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.inverse import check_limits
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.applied import placed_in_words, workspace_report
 from calib_ros.report.page import markdown

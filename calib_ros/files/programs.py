@@ -26,8 +26,7 @@ from calib_ros.files.sheets import decimal_sign, refuse_short, text_and_separato
 from calib_ros.files.vocabulary import ANGLES, LENGTHS, POSE_COLUMNS, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.chain_file import TWO_TURNS
-from calib_ros.kinematics.inverse import a_turn_away, limits
+from calib_ros.kinematics.inverse import check_limits, check_turns
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
 from calib_ros.values import parse_numbers
@@ -64,41 +63,6 @@ def _columns(path: Path) -> tuple[Columns, str, str]:
     if separator == ' ':
         refuse_short(found, found.header[-1])
     return found, separator, text
-
-
-def check_limits(
-    values: FloatArray,
-    chain: Chain,
-    where: Callable[[int, int], str],
-    remedy: Callable[[int], str] = lambda i: ', not degrees',
-) -> None:
-    """Refuse joint values (N, n) 1e-3 beyond their limits, or as `check_turns`."""
-    check_turns(values, chain, where)
-    lower, upper = limits(chain)
-    beyond = (values < lower - 1e-3) | (values > upper + 1e-3)
-    for k, i in np.argwhere(beyond)[:1].tolist():
-        raise InputError(
-            f'{where(k, i)}{values[k, i]:.6g} is beyond the limits of {chain.joint_names[i]}, '
-            f'{lower[i]:.6g} to {upper[i]:.6g} (rad or m{remedy(i)})'
-            + a_turn_away(chain.joints[i], float(values[k, i]))
-        )
-
-
-def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], str]) -> None:
-    """Refuse joint values (N, n) that may be degrees or millimetres, of joints without limits.
-
-    `where` names a row and a joint.
-    """
-    free = [None in (joint.lower, joint.upper) for joint in chain.joints]
-    for k, i in np.argwhere((np.abs(values) > TWO_TURNS) & free)[:1].tolist():
-        joint = chain.joints[i]
-        turns = joint.type == 'revolute'
-        what = f'two turns of {joint.name}' if turns else f'{TWO_TURNS:.1f} m for {joint.name}'
-        raise InputError(
-            f'{where(k, i)}{values[k, i]:.6g} is more than {what}, which has no limits: joint '
-            f'values must be in {"radians" if turns else "metres"}; if they are, give the joint '
-            'limits (lower, upper) in the chain file'
-        )
 
 
 def _program(found: Columns, chain: Chain) -> tuple[Columns, tuple[str, ...], FloatArray, Program]:

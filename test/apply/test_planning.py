@@ -127,6 +127,9 @@ def test_wrong_arguments_are_refused():
         choose(design, q, 0)
     with pytest.raises(ConfigError, match='unknown criterion "e"'):
         choose(design, q, 5, 'e')
+    for in_degrees in (np.degrees(q), q), (q, np.degrees(q)):
+        with pytest.raises(InputError, match=r'\[0, .*beyond the limits of .*not degrees'):
+            planning.plan(design, *in_degrees, 5)
 
 
 def measured_problem(name, session):

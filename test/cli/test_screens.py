@@ -132,7 +132,7 @@ def test_the_help_of_a_command(shown, name):
         (('identify', 'x.csv', '--chian', 'ur5e'), 'option "--chian": did you mean "--chain"?'),
         (('bag2csv', 'bag', 't.csv', '--chain', 'ur5e', '--xyz'), 'unknown option "--xyz"\n'),
         (('robots', 'ur5e'), 'unexpected argument "ur5e"\n'),
-        (('identify', 'a.csv', 'b.csv', *UR5E), 'make one table, with a column session (or target'),
+        (('identify', 'a.csv', 'b.csv', *UR5E), 'make one table, with a column session (or'),
         (('chain',), 'required: ROBOT'),
         (('identify', 'measured.csv'), '--chain (calib_ros robots lists the arms supplied)'),
         (('verify', 'a.csv', '--tolerance', '0,2'), "must be a number such as 0.1, not '0,2'"),
