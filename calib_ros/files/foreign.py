@@ -71,7 +71,7 @@ class Foreign:
         made, matched = table.columns(), ''
         notes = [f'{path}: {note}' for note in table.notes]
         if self.log is not None:
-            log = _Table(self.log, self.log_layout, self.chain, True, alone=True)
+            log = _Table(self.log, self.log_layout, self.chain, True, table.decimal)
             joints, matched = self._logged(log, table, made)
             how = f'by the column "{matched}"' if matched else 'row by row'
             notes += [f'{self.log}: {note}' for note in log.notes]
@@ -127,8 +127,9 @@ class _Table:
     """A table whose columns are found: ours as expressions of theirs, by their numbers."""
 
     def __init__(
-        self, path: Path, layout: Layout, chain: Chain | None, joints: bool, alone: bool = False
+        self, path: Path, layout: Layout, chain: Chain | None, joints: bool, unclear: str = ''
     ) -> None:
+        alone = bool(unclear)  # without measurements, beside a table with that decimal sign
         self.path, self._layout, self._chain = path, layout, chain
         most = MOST_NAMES if chain is None else len(chain.joints)
         asked: dict[str, Expression] = {}
@@ -150,9 +151,10 @@ class _Table:
             own |= zip(called, ours_of, strict=True)
         if not alone:
             own |= {name: name for name in (*NUMBERS, *WORDS)}
-        self._sheet = read_sheet(path, layout, list(needed), own)
+        self._sheet = read_sheet(path, layout, list(needed), own, unclear or '.')
         self.names = tuple(name_and_unit(name)[0] for name in self._sheet.header)
         self.has = f'it has {listed(self._sheet.header)}'
+        self.decimal = self._sheet.columns.decimal
         kept, left = without_statistics(self._sheet.columns)
         self._sheet, self.count = replace(self._sheet, columns=kept), len(kept.lines)
         self.notes = [*self._sheet.notes, *left]

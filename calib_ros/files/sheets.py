@@ -84,21 +84,21 @@ class _Content:
 
 
 def read_sheet(
-    path: Path, layout: Layout, names: Sequence[str], known: Mapping[str, str]
+    path: Path, layout: Layout, names: Sequence[str], known: Mapping[str, str], unclear: str = '.'
 ) -> Sheet:
     """Read a table with a known layout; of a workbook the sheet named, or the first that fits.
 
     The header is the first line with all column `names`; if these are only numbers, the first with
-    some of the `known` names.
+    some of the `known` names. `unclear` is the decimal sign if 1,554 may be thousands.
     """
     if path.suffix.lower() not in SHEETS:
-        return _sheet(path, _of_text(path, layout), layout, names, known)
+        return _sheet(path, _of_text(path, layout), layout, names, known, unclear)
     faults: list[str] = []
     found: list[Sheet] = []
     for title, notes, rows in sheets_of(path, layout.sheet):
         content = _Content(iter([rows]), notes, title=title)
         try:
-            sheet = _sheet(path, content, layout, names, known)
+            sheet = _sheet(path, content, layout, names, known, unclear)
         except InputError as err:
             faults.append(f'sheet "{title}": {err}')
             continue
@@ -144,7 +144,12 @@ def _of_text(path: Path, layout: Layout) -> _Content:
 
 
 def _sheet(
-    path: Path, content: _Content, layout: Layout, names: Sequence[str], known: Mapping[str, str]
+    path: Path,
+    content: _Content,
+    layout: Layout,
+    names: Sequence[str],
+    known: Mapping[str, str],
+    unclear: str,
 ) -> Sheet:
     rows, notes = content.rows, content.notes
     whole = list[Cells]()
@@ -161,7 +166,7 @@ def _sheet(
     used += [int(name[1:]) - 1 for name in names if name.startswith('#')]
     used += [k for k, cell in enumerate(header) if name_and_unit(cell)[0].lower() in low]
     cells = (row[k] for _, row in head[at + 1 :] for k in used if k < len(row))
-    decimal = layout.decimal or decimal_sign(cells)
+    decimal = layout.decimal or decimal_sign(cells, unclear)
     if decimal == ',' and not layout.decimal:
         notes.append('numbers have decimal commas (--decimal)')
     first = _first(path, head, at, used, decimal, notes)
@@ -183,8 +188,7 @@ def _sheet(
         refuse_short(columns, f'#{len(header)}')
     refuse_nominal(columns, [*above, *left])
     if left:
-        without = lines_in_words([line for line, _ in left])
-        notes.append(f'there are no numbers in {without}: skipped')
+        notes.append(f'there are no numbers in {lines_in_words([n for n, _ in left])}: skipped')
     header = (*header, *[''] * (len(columns.header) - len(header)))
     between = ' ' if content.blanks else '\t'
     words = (*content.comments, *(between.join(cells) for _, cells in (*above, *left)))
@@ -249,12 +253,12 @@ def _narrow(text: str, separator: str) -> str:
     return re.sub(words, lambda line: before.sub('', line[0]), text)
 
 
-def decimal_sign(cells: Iterable[str]) -> str:
+def decimal_sign(cells: Iterable[str], unclear: str = '.') -> str:
     """Return the decimal sign in cells of numbers; 1,554 has one where all have such a comma."""
     numbers = [cell for cell in cells if _is_number(cell, ',')]
     decimals = [cell for cell in numbers if DECIMAL_COMMA.fullmatch(cell)]
     clear = len(decimals) == len(numbers) or not all(map(THOUSANDS.fullmatch, decimals))
-    return ',' if decimals and clear else '.'
+    return (',' if clear else unclear) if decimals else '.'
 
 
 def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tuple[str, ...]:

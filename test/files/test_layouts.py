@@ -377,3 +377,18 @@ def test_lines_of_several_units_are_refused_unless_each_column_has_its_own(
             read_table(path, 2, foreign=Foreign(Layout()))
     else:
         assert read_table(path, 2, foreign=Foreign(Layout())).fitted[0].positions[0, 2] == 3.0
+
+
+@pytest.mark.parametrize('given', ['', ','])
+def test_a_log_whose_commas_may_be_of_thousands_has_those_of_the_table_beside_it(tmp_path, given):
+    """--decimal comma, which the message advised, changed nothing."""
+    log, path = tmp_path / 'log.csv', tmp_path / 'points.csv'
+    log.write_text('J1;J2\n-115,780;30\n90;1,500\n')
+    path.write_text('x;y;z\n0,25;1,5;0\n0,5;1;2,5\n')
+    layout = Layout(columns={'q1': 'J1', 'q2': 'J2'}, angle='deg')
+    foreign = Foreign(replace(layout, decimal=given), None, log, layout)
+    (found,) = read_table(path, 2, foreign=foreign).fitted
+    np.testing.assert_allclose(np.degrees(found.joints), [[-115.78, 30], [90, 1.5]])
+    path.write_text(path.read_text().replace(',', '.'))
+    with pytest.raises(InputError, match=r"'1,500': write a point"):
+        read_table(path, 2, foreign=replace(foreign, layout=layout))
