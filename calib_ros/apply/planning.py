@@ -288,8 +288,7 @@ def plan(
     orders = [rng.permutation(len(candidates))[:count] for _ in range(draws)]
     at_random = [accuracy(excited, candidates[order], task) for order in orders]
     predictions = accuracy(excited, found, task)
-    known = independent(triangular(excited.known), excited.names)
-    unknown = len(excited.names) - len(known)
+    unknown = len(excited.names) - len(independent(triangular(excited.known), excited.names))
     bound = None
     if criterion in ('d', 'task') and np.isfinite(predictions[-1]):
         bound = efficiency(excited, candidates, chosen, task if criterion == 'task' else None)
