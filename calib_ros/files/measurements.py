@@ -305,7 +305,10 @@ def _stamps(columns: Columns) -> NDArray[np.int64]:
     try:
         return columns.integers('stamp_ns', lines)
     except InputError as err:
-        raise InputError(f'{err}; if it is in seconds, give --columns time=stamp_ns') from err
+        told = 'if it is in seconds, give --columns time=stamp_ns'
+        if any('e' in cell.lower() for cell in columns.texts('stamp_ns')):
+            told = 'a spreadsheet program has rounded the stamps: remove or rename that column'
+        raise InputError(f'{err}; {told}') from err
 
 
 def _devices(columns: Columns, kind: Index) -> Codes:

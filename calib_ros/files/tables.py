@@ -140,9 +140,11 @@ def _chosen(found: Columns, joints: int, sessions: Sequence[str]) -> Measurement
 def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> Index:
     numbers, known = labels
     if not sessions and len(known) > 1:
+        named = ', '.join(filter(None, known))
+        blank = '; rows without one are left out: name it in each (merged cells: in the first)'
         raise InputError(
-            f'{path} holds several sessions, choose one of {", ".join(known)} (or several, '
-            'joined by commas, to fit them together)'
+            f'{path} holds several sessions, choose one of {named} (or several, joined by commas, '
+            f'to fit them together){blank * ("" in known)}'
         )
     for k, name in enumerate(sessions):
         if name in sessions[:k]:

@@ -191,6 +191,9 @@ def test_stamps_in_seconds_are_told_what_to_give(tmp_path):
     columns = {'time': 'stamp_ns'}
     (found,) = read_table(path, 2, foreign=Foreign(Layout(columns=columns))).fitted
     np.testing.assert_allclose(found.stamps_ns, 1_700_000_000_250_000_000, rtol=1e-15)
+    path.write_text('stamp_ns,q1,q2,x,y,z\n1.7E+18,1,2,3,4,5\n')
+    with pytest.raises(InputError, match='rounded the stamps: remove or rename that column'):
+        read_table(path, 2)
 
 
 def test_a_time_with_decimal_commas_is_no_date(tmp_path):

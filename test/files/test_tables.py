@@ -270,7 +270,10 @@ def test_a_pipe_in_another_form_is_told_to_be_saved():
 def test_columns_of_names_are_read_in_any_case(tmp_path, name):
     path = tmp_path / 'cell.csv'
     path.write_text(SESSIONS.replace('session', name))
-    with pytest.raises(InputError, match='holds several sessions, choose one of A, B'):
+    with pytest.raises(InputError, match=r'several sessions, choose one of A, B .* together\)$'):
+        read_table(path, 2)
+    path.write_text('q1,q2,x,y,z,session\n0,0,1,2,3,A\n0,0,1,2,3,\n0,0,1,2,3,B\n')
+    with pytest.raises(InputError, match=r'one of A, B .*without one are left out: name it'):
         read_table(path, 2)
 
 
