@@ -32,10 +32,14 @@ def some(words: Sequence[str], most: int = NAMED) -> list[str]:
 
 
 def rounded(value: float) -> str:
-    """Return a value with three decimals, more if two digits need them, or none from 1e3 on."""
+    """Return mm or mrad with three decimals, more if two digits need them, or none from 1e3 on.
+
+    Less than 1e-6 is what computing leaves.
+    """
     if math.isfinite(value) and abs(value) >= 1e3:
         return f'{value:{"," * (abs(value) >= 1e4)}.0f}'  # 1,210 may be read as 1.210
-    digits = 1 - math.floor(math.log10(abs(value))) if value and math.isfinite(value) else 0
+    tells = math.isfinite(value) and abs(value) >= 1e-6
+    digits = 1 - math.floor(math.log10(abs(value))) if tells else 0
     return f'{value:.{max(3, digits)}f}'
 
 

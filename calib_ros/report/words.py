@@ -27,6 +27,7 @@ from calib_ros.kinematics.se3 import to_quat
 from calib_ros.report.advice import COARSE, FAR
 from calib_ros.settings import Settings
 from calib_ros.shown import counted, moment, of_them, rounded, some
+from calib_ros.values import SAME
 
 WEAK = Settings.largest_error
 """Standard deviation [m or rad] beyond which a parameter is named as weakly determined: an arm
@@ -136,7 +137,7 @@ def notes(result: Identification) -> list[str]:
 def in_part(result: Identification) -> str:
     """Return what errors of distances, planes and corners mean; empty for positions alone."""
     position = result.fitted.after.position
-    if (position[:, 0] != 0.0)[~position[:, 1:].any(axis=1)].any():
+    if (np.abs(position[:, 0]) > SAME)[~position[:, 1:].any(axis=1)].any():
         return (
             'errors of distances and touched planes are along one direction: position errors in '
             'space are about 1.7 times as large if alike in all directions'

@@ -259,3 +259,15 @@ def test_errors_of_pure_numbers_have_a_unit_that_exists():
     value, unit = float(row[1]), row[5]
     assert (unit, f'{1e3 * value:+.4f}') == ('‰', row[2])
     assert any(text.endswith(' ‰') for text in table.text)
+
+
+def test_what_computing_leaves_of_poses_without_noise_is_no_distance():
+    """One of 60 missed along x alone, by 1e-16 m, and distances were told of."""
+    result = identify(problem_of())
+    position = 1e-16 * np.ones((40, 3))
+    position[0, 1:] = 0.0
+    after = replace(result.fitted.after, position=position)
+    of_poses = replace(result, fitted=replace(result.fitted, after=after))
+    assert words.in_part(of_poses) == ''
+    position[0, 0] = 1e-4
+    assert 'errors of distances' in words.in_part(of_poses)
