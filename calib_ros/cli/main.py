@@ -123,9 +123,9 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
 
 def _unknown(word: str, parser: argparse.ArgumentParser) -> str:
     if not word.startswith('-'):
-        tables = '--session' in parser._option_string_actions
         hint = ': of several files make one table, with a column session (or target, device)'
-        return f'unexpected argument "{word}"' + hint * tables
+        several = hint * ('--session' in parser._option_string_actions)
+        return f'unexpected argument "{word}"{several}'
     option = word.partition('=')[0]
     known = (each for action in parser._actions for each in action.option_strings)
     hint = near(option, known, 0.7)

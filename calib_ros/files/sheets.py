@@ -81,6 +81,7 @@ class _Content:
     title: str = ''
     comments: Sequence[str] = ()
     blanks: bool = False  # separate the cells
+    unclear: str = '.'  # the decimal sign if 1,554 may be thousands
 
 
 def read_sheet(
@@ -89,16 +90,17 @@ def read_sheet(
     """Read a table with a known layout; of a workbook the sheet named, or the first that fits.
 
     The header is the first line with all column `names`; if these are only numbers, the first with
-    some of the `known` names. `unclear` is the decimal sign if 1,554 may be thousands.
+    some of the `known` names.
     """
     if path.suffix.lower() not in SHEETS:
-        return _sheet(path, _of_text(path, layout), layout, names, known, unclear)
+        content = replace(_of_text(path, layout), unclear=unclear)
+        return _sheet(path, content, layout, names, known)
     faults: list[str] = []
     found: list[Sheet] = []
     for title, notes, rows in sheets_of(path, layout.sheet):
-        content = _Content(iter([rows]), notes, title=title)
+        content = _Content(iter([rows]), notes, title=title, unclear=unclear)
         try:
-            sheet = _sheet(path, content, layout, names, known, unclear)
+            sheet = _sheet(path, content, layout, names, known)
         except InputError as err:
             faults.append(f'sheet "{title}": {err}')
             continue
@@ -144,12 +146,7 @@ def _of_text(path: Path, layout: Layout) -> _Content:
 
 
 def _sheet(
-    path: Path,
-    content: _Content,
-    layout: Layout,
-    names: Sequence[str],
-    known: Mapping[str, str],
-    unclear: str,
+    path: Path, content: _Content, layout: Layout, names: Sequence[str], known: Mapping[str, str]
 ) -> Sheet:
     rows, notes = content.rows, content.notes
     whole = list[Cells]()
@@ -166,7 +163,7 @@ def _sheet(
     used += [int(name[1:]) - 1 for name in names if name.startswith('#')]
     used += [k for k, cell in enumerate(header) if name_and_unit(cell)[0].lower() in low]
     cells = (row[k] for _, row in head[at + 1 :] for k in used if k < len(row))
-    decimal = layout.decimal or decimal_sign(cells, unclear)
+    decimal = layout.decimal or decimal_sign(cells, content.unclear)
     if decimal == ',' and not layout.decimal:
         notes.append('numbers have decimal commas (--decimal)')
     first = _first(path, head, at, used, decimal, notes)

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -65,12 +67,8 @@ class Run:
 
     filed: int = 0
     seconds: float = 0.0
-    errors: dict[str, dict[str, str]] = field(default_factory=dict)
-    copies: dict[str, dict[str, str]] = field(default_factory=dict)
-
-    def note(self, serial: str, source: str, error: str) -> None:
-        """Record the error of a source."""
-        self.errors.setdefault(serial, {})[source] = error
+    errors: dict[str, dict[str, str]] = field(default_factory=partial(defaultdict, dict))
+    copies: dict[str, dict[str, str]] = field(default_factory=partial(defaultdict, dict))
 
 
 def run(
@@ -148,11 +146,11 @@ def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[T
     try:
         rows = results(robot, history.rows(robot.serial))
     except CalibrationError as err:
-        found.note(robot.serial, '', str(err))
+        found.errors[robot.serial][''] = str(err)
         return []
     present, wrong = sources(robot)
-    for pattern, words in wrong.items():
-        found.note(robot.serial, pattern, words)
+    if wrong:
+        found.errors[robot.serial] |= wrong
     if not present:
         return []
     nights = tuple((row.source, row.time) for row in rows)
@@ -186,26 +184,23 @@ def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, foun
     found.seconds += outcome.seconds
     row, serial, source, first = outcome.row, task.robot.serial, task.source.name, outcome.known
     if outcome.error:
-        found.note(serial, source, outcome.error)
+        found.errors[serial][source] = outcome.error
     if row is not None and history.file(row):
         found.filed += 1
     elif row is not None:  # filed meanwhile
         first = next(r.source for r in history.rows(serial) if r.key == row.key)
     if first not in ('', source):
-        found.copies.setdefault(serial, {})[source] = first
+        found.copies[serial][source] = first
     if row is not None and outcome.page and out is not None:
         try:
-            _write_page(page_path(out, row), outcome.page)
+            path = page_path(out, row)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_file(path, outcome.page, overwrite=True)
+            for earlier in path.parent.glob(f'{"[0-9a-f]" * 64}.html'):
+                if earlier != path:
+                    earlier.unlink(missing_ok=True)
         except OSError as err:
-            found.note(serial, source, f'the page of its report: {trouble(err)}')
-
-
-def _write_page(path: Path, page: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, page, overwrite=True)
-    for earlier in path.parent.glob(f'{"[0-9a-f]" * 64}.html'):
-        if earlier != path:
-            earlier.unlink(missing_ok=True)
+            found.errors[serial][source] = f'the page of its report: {trouble(err)}'
 
 
 @contextmanager

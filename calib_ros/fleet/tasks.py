@@ -151,8 +151,8 @@ def _uncounted(found: Dataset, task: Task) -> Dataset:
     """Return a table without the poses that it had in an earlier night, if it has grown."""
     sets = (*found.fitted, *found.held_out)
     last = measured_at(sets, NEVER)
-    nights = (time for source, time in task.nights if source == task.source.name)
-    then = max((time for time in nights if time < last), default=NEVER)
+    nights = (t for source, t in task.nights if source == task.source.name and t < last)
+    then = max(nights, default=NEVER)
     up_to = 1e9 * then.timestamp() + 1e6  # a row has its time to a microsecond
     new = [each.select(each.stamps_ns > up_to) for each in sets]
     count = sum(map(len, new))
