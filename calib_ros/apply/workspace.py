@@ -134,8 +134,7 @@ def rms_map(
     number, first_edges, second_edges = np.histogram2d(first, second, cells)
     edges = (first_edges, second_edges)
     squares = np.histogram2d(first, second, edges, weights=errors**2)[0]
-    rms = np.sqrt(squares / np.where(number > 0, number, np.nan))
-    return first_edges, second_edges, rms
+    return first_edges, second_edges, np.sqrt(squares / np.where(number > 0, number, np.nan))
 
 
 AROUND = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1

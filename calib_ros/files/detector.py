@@ -145,8 +145,7 @@ class Detector:
             part = self._halved(image[first[1] : last[1], first[0] : last[0]], k)
             among = _dictionary(self._board.dictionary)
             among.bytesList = among.bytesList[missing]
-            share = max(last - first) / max(size)
-            more, number = self._markers(part, among, windows, share)
+            more, number = self._markers(part, among, windows, max(last - first) / max(size))
             more = (more + 0.5) * ((last - first) / part.shape[1::-1]) - 0.5 + first
             corners = np.concatenate([corners, more])
             ids = np.concatenate([ids, missing[number]])

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import csv
 import io
+from codecs import BOM_UTF8
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -191,6 +192,8 @@ def _read_csv(path: Path, chain: Chain) -> ProgramFile:
         approach[:, known] = np.sign(found.block([signs[k] for k in known]))
         program = replace(program, approach=approach)
 
+    mark = '\ufeff' * path.read_bytes().startswith(BOM_UTF8)
+
     def text_with(corrected: Program) -> str:
         lines = csv.reader(io.StringIO(text, newline=''), delimiter=separator)
         header, *rows = (row for row in lines if any(row))
@@ -200,7 +203,7 @@ def _read_csv(path: Path, chain: Chain) -> ProgramFile:
         for row, values in zip(rows, (corrected.positions / units[given]).tolist(), strict=True):
             for k, value in zip(at, values, strict=True):
                 row[k] = repr(value).replace('.', found.decimal)
-        return csv_text([header, *rows], separator, '\r\n' if '\r\n' in text else '\n')
+        return mark + csv_text([header, *rows], separator, '\r\n' if '\r\n' in text else '\n')
 
     return ProgramFile(program, tuple(f'line {line}' for line in found.lines), text_with)
 

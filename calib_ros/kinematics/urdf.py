@@ -196,8 +196,7 @@ def _refuse_others(arm: Chain, nominal: Chain) -> None:
 
 def _coupling(joint: DescribedJoint) -> str:
     """Return the name of the effect that couples a joint to the one that it mimics."""
-    leader = joint.follows[0] if joint.follows else ''
-    return f'{joint.name}.coupling_{leader}'
+    return f'{joint.name}.coupling_{joint.follows[0] if joint.follows else ""}'
 
 
 def _row(joint: DescribedJoint) -> Joint:
