@@ -151,7 +151,7 @@ def _of_the_gain(
     elif result.chance is not None and result.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
-            'as with a slow drift, time-shifted residuals are explained just as well in '
+            'as those of a slow drift, errors moved to other poses are explained just as well in '
             f'{100.0 * result.chance:.0f} % of cases (limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )
     elif scaled:

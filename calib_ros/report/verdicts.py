@@ -191,8 +191,8 @@ def causes(found: Verification) -> list[str]:
     elif found.common < NEARER:
         lines.append(
             f'one common shift and turn of all positions explains all but {common:.2g} % of the '
-            'error: was the measuring device moved, or what it sees from the flange? If so, '
-            'verify again with --new-base (and --new-tool for a new target); if not, find out '
+            'error: was the measuring device moved (with a camera on the flange: its target)? If '
+            'so, verify again with --new-base (and --new-tool for a new target); if not, find out '
             'what moved'
         )
     return lines
