@@ -151,7 +151,7 @@ def _of_the_gain(
     elif result.chance is not None and result.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
-            'as those of a slow drift, errors moved to other poses are explained just as well in '
+            'moved to other poses, errors are explained as well, as a slow drift would be, in '
             f'{100.0 * result.chance:.0f} % of cases (limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )
     elif scaled:

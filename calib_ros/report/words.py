@@ -272,7 +272,7 @@ def unmodelled_in_words(result: Identification) -> str:
     lacking = result.posterior.unmodelled
     seen = lacking.waves * lacking.shown  # else assumed
     across = np.hypot(lacking.tilts, np.sqrt(2.0) * seen)
-    sizes = (1e3 * lacking.turns, 'about their axes'), (1e3 * across, 'across them')
+    sizes = (1e3 * lacking.turns, 'about their axes'), (1e3 * across, 'across their axes')
     off = ' and '.join(f'{size:.3f} mrad {way}' for size, way in sizes if round(size, 3))
     come = 'may come' if result.noise.consistent else 'seems to come'
     text = (
