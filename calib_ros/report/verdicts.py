@@ -150,7 +150,7 @@ def hints(found: Verification) -> list[str]:
     if found.fitted:
         lines.append(f'{" and ".join(found.fitted)} refitted, before and after alike')
     if found.verdict == 'UNDECIDED' and not found.outside:
-        enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
+        enough = f'about {found.needed:,}' if found.needed else f'not even {DECIDING:,}'
         lines.append(f'{enough} poses with the same RMS error would decide, these included')
     before, rms = (each.rms_mm for each in found.comparison.figures)
     if found.outside and not found.mistake:
