@@ -188,7 +188,7 @@ def verify(
     lost = new_base + new_tool + (new_tool if all(each.seen for each in sets) else new_base)
     rms, numbers, freedom, lower, upper = _interval(moments, lost, confidence, DECIDING)
     mistake = _mistake(arm, sets, rms, 1e-3 * (comparison.figures[1].rms_mrad or 0.0))
-    reused, limit = arm.reused(sets), tolerance or arm.limit(sets)
+    reused, limit = arm.reused(sets), tolerance or arm.limit(sets, comparison.figures[0].rms_mm)
     verdict, needed = _decided(limit, lower, upper, numbers)
     if mistake or (reused and verdict != 'FAIL'):
         verdict, needed = 'no verdict', None

@@ -221,11 +221,11 @@ class Calibration(Shown):
             )
         return left
 
-    def limit(self, sets: Sequence[Observations] = ()) -> float | None:
+    def limit(self, sets: Sequence[Observations] = (), rms_mm: float = np.inf) -> float | None:
         """Return the largest RMS error [m] of new poses at which it still holds, None if unknown.
 
         ALIKE times its former error; if larger, ALIKE times the error expected at the poses of
-        `sets`, but no more than it removes there.
+        `sets`, but no more than it removes there, or the error `rms_mm` of the nominal arm.
         """
         if self.residual is None:
             return None
@@ -235,7 +235,7 @@ class Calibration(Shown):
         joints = np.concatenate([each.spread().joints for each in sets])
         sizes = np.nan_to_num(self.sigma(joints)), self.removed(joints)[0]
         expected, removed = (float(np.sqrt(np.mean(each**2))) for each in sizes)
-        return max(former, min(ALIKE * expected, removed))
+        return max(former, min(ALIKE * expected, removed, 1e-3 * rms_mm))
 
     def reused(self, sets: Sequence[Observations]) -> float:
         """Return the share of measurements that this calibration was fitted to, if known."""

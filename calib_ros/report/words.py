@@ -198,7 +198,7 @@ def verdict(
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
     since = f'{counted(now.count, "pose")} measured since'
     text += f'{since}; the nominal chain has {nominal.rms_mm:.3f} mm'
-    limit = calibration.limit(sets)
+    limit = calibration.limit(sets, nominal.rms_mm)
     if limit is None:
         text = f'no verdict, the calibration has no former error: {text}'
         return 'no verdict', f'{text}; judge with calib_ros verify --tolerance'
