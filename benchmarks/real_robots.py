@@ -121,7 +121,7 @@ def transfer():
     """Yield how well the arm of one session of the UR10 predicts the other."""
     problems = {session: problem_of(UR10, session, 'chain.yaml') for session in 'AB'}
     for source, target in ('BA', 'AB'):
-        for model in ('geometric', 'auto'):
+        for model in ('geometric', 'gravity', 'eccentricity', 'auto'):
             result = identify_model(problems[source], model)
             arm = [name for name in result.names if not result.chain.owns_frame(name)]
             known = replace(result.chain, base=None, tool=None)
