@@ -37,9 +37,7 @@ from calib_ros.files.bags import replay
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.sampling.messages import JOINT_STATE
-from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.settings import Settings
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types
@@ -124,12 +122,8 @@ def write(path, content, storage, compression):
             writer.write(connections[topic], stamp, data)
 
 
-class Nobody:
-    """Stands for a session that takes decoded messages and does nothing with them."""
-
-    settings = Settings()
-    pictures = Pictures(lambda: Settings.sigma_pixel)
-    warnings = ()
+class Nobody(CalibrationSession):
+    """A session that takes decoded messages and does nothing with them."""
 
     def miss(self, kind, count, cause):
         """Do nothing."""
@@ -161,10 +155,10 @@ def measured(path, large, count, other):
 
     The shortest of three times, all in turn, so that they share what else the machine does.
     """
-    sessions = []
+    sessions, chain = [], load_chain('ur10e')
 
     def whole():
-        sessions.append(CalibrationSession(load_chain('ur10e')))
+        sessions.append(CalibrationSession(chain))
         replay(path, sessions[-1])
 
     def timed(work):
@@ -173,10 +167,10 @@ def measured(path, large, count, other):
         return 1e6 * (time.process_time() - begin) / count
 
     works = {
-        'decoded': lambda: timed(lambda: replay(path, Nobody())),
+        'decoded': lambda: timed(lambda: replay(path, Nobody(chain))),
         'replay': lambda: timed(whole),
         'rosbags': lambda: timed(lambda: by_rosbags(path)),
-        'foreign': lambda: timed(lambda: replay(large, Nobody())),
+        'foreign': lambda: timed(lambda: replay(large, Nobody(chain))),
     }
     if other and any(path.glob('*.mcap')):
         works['mcap-ros2-support'] = lambda: by_other(other, path)
