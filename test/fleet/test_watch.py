@@ -107,10 +107,11 @@ def test_first_nights_that_scatter_more_are_no_alarm(first, rng, scatter):
     assert not any(each.changes for each in found)
 
 
-def test_a_drift_that_no_night_shows_is_found(first, rng):
-    rows = list(nights(first, rng, 60))
-    which = np.array(first.names) == 'wrist_1_joint.d'
-    rows = [replace(row, offsets=row.offsets + 2e-6 * k * which) for k, row in enumerate(rows)]
+@pytest.mark.parametrize(('per_year', 'count'), [(2e-4, 300), (4e-4, 90)])
+def test_a_drift_that_no_night_shows_is_found(first, rng, per_year, count):
+    rows = list(nights(first, rng, count))
+    slope = per_year / 365.25 * (np.array(first.names) == 'wrist_1_joint.d')
+    rows = [replace(row, offsets=row.offsets + slope * k) for k, row in enumerate(rows)]
     changes = watch(rows, 100.0).changes
     assert changes
     for change in changes:
