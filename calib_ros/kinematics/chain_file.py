@@ -105,12 +105,17 @@ def _refuse_other_units(chain: Chain, where: str) -> None:
             f'{where}: its links are {length:.0f} m long: lengths must be in metres, 300 mm as 0.3'
         )
     for k, joint in enumerate(chain.joints, 1):
-        for key in ('lower', 'upper') if joint.type == 'revolute' else ():
+        for key in ('lower', 'upper'):
             limit = float(getattr(joint, key) or 0.0)
-            if abs(limit) > TWO_TURNS and limit.is_integer():
+            if joint.type == 'prismatic':
+                wrong, unit, other, value = abs(limit) > 100.0, 'metres', 'mm', limit / 1e3
+            else:
+                wrong = abs(limit) > TWO_TURNS and limit.is_integer()
+                unit, other, value = 'radians', 'degrees', math.radians(limit)
+            if wrong:
                 raise ConfigError(
-                    f'{where}: joint {k}: {key} must be in radians, not {limit:g}: write degrees '
-                    f'as {math.radians(limit):.9g}, or leave it out if there is no limit'
+                    f'{where}: joint {k}: {key} must be in {unit}, not {limit:g}: write {other} '
+                    f'as {value:.9g}, or leave it out if there is no limit'
                 )
 
 
@@ -323,7 +328,7 @@ def _joint(row: object, where: str) -> Joint:
     for key in ('lower', 'upper'):
         if content.get(key) is not None:
             limit = parse_number(content[key], f'{where}: {key}', largest=math.inf)
-            if abs(limit) <= LARGEST:  # larger ones mean none
+            if abs(limit) < 0.09 * LARGEST:  # larger ones, as 99999, mean none
                 numbers[key] = limit
     sign = numbers.pop('sign', 1.0)
     x, y, z = parse_numbers(content.get('com', [0.0, 0.0, 0.0]), 3, f'{where}: com').tolist()

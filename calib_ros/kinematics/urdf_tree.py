@@ -265,7 +265,7 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
     limit = _child(element, 'limit')
     if kind in ('revolute', 'prismatic') and set(ENDS) & set(limit.keys()):
         ends = (_numbers(limit, key, f'limit of {where}', '0', 1, math.inf) for key in ENDS)
-        lower, upper = (float(x[0]) if abs(x[0]) <= LARGEST else None for x in ends)
+        lower, upper = (float(x[0]) if abs(x[0]) < 0.09 * LARGEST else None for x in ends)
     follows, mimic = None, element.find('mimic')
     if mimic is not None and kind in MOVING_TYPES:
         of = f'mimic of {where}'

@@ -307,6 +307,16 @@ def test_limits_in_degrees_are_refused(tmp_path, name, text):
         load_chain(tmp_path / name)
 
 
+def test_limits_in_millimetres_are_refused(tmp_path):
+    """A plan drove the rail to 2,961 m."""
+    text = dump_chain(load_chain('ur10e_on_linear_axis')).replace('upper: 3.0', 'upper: 3000.0')
+    (tmp_path / 'cell.yaml').write_text(text)
+    with pytest.raises(
+        ConfigError, match=r'joint 1: upper must be in metres, not 3000: write mm as 3, or'
+    ):
+        load_chain(tmp_path / 'cell.yaml')
+
+
 @pytest.mark.parametrize('name', ['cell.yaml', 'cell.urdf'])
 def test_lengths_in_millimetres_are_refused(tmp_path, name):
     """A plan for an arm of 1,700 m asked for six poses."""
