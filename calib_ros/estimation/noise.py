@@ -15,6 +15,7 @@ from calib_ros.estimation import identifiability
 from calib_ros.estimation.identifiability import Uncertainty
 from calib_ros.estimation.leastsquares import Fit, System
 from calib_ros.estimation.levels import SURE
+from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import SUSPICIOUS
 from calib_ros.estimation.shared_errors import shared_errors
@@ -130,18 +131,26 @@ def noise_of(
 def squares_of(chain: Chain, system: System) -> FloatArray:
     """Return by part (4, 2) sums and counts of squared residuals, alone and over configurations.
 
-    If pairs of a configuration share no error, squares of their sums add up to the same.
+    If pairs of a configuration, of any targets, share no error, squares of their sums add up to
+    the same.
     """
     found = np.zeros((4, 2))
     sums, counts, joint_sums, joint_counts = found  # views
-    for samples in system.sets:
+    shared: dict[tuple[int, str, int], FloatArray] = {}
+    every = numbered([samples.observations for samples in system.sets])
+    count = 1 + max(int(numbers.max(initial=-1)) for numbers in every)
+    for samples, numbers in zip(system.sets, every, strict=True):
+        seen = samples.observations
         for k, part in enumerate(samples.whitened_residuals(chain)):
             known = np.flatnonzero(~np.isnan(part[:, 0]))
             roots = np.ones(len(known)) if samples.weights is None else samples.weights[known]
             weighted = roots * part.take(known, axis=0).T
             sums[k] += np.sum(weighted**2)
-            counts[k] += part.shape[1] * (roots @ roots)
-            groups = samples.observations.configurations[known]
-            joint_sums[k] += sum((np.bincount(groups, row) ** 2).sum() for row in weighted)
-            joint_counts[k] += part.shape[1] * np.count_nonzero(np.bincount(groups))
+            counts[k] += len(weighted) * (roots @ roots)
+            key = k, seen.tool if seen.seen else seen.base, len(weighted)
+            together = shared.setdefault(key, np.zeros((len(weighted), count)))
+            together += [np.bincount(numbers[known], row, count) for row in weighted]
+    for (k, *_), together in shared.items():
+        joint_sums[k] += np.sum(together**2)
+        joint_counts[k] += len(together) * np.count_nonzero(together.any(axis=0))
     return found

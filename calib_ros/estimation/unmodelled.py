@@ -30,12 +30,14 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import special
 
+from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.identifiability import covariance
 from calib_ros.estimation.joint_errors import Unmodelled, moved, moving, waved
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SEVERAL
 from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.robust import SUSPICIOUS
 from calib_ros.estimation.samples import gram
 from calib_ros.estimation.shared_errors import gathered, nonnegative
 from calib_ros.estimation.sizes import LEAST_SIZE, REFUTED, SHOWN, SPREAD, TYPICAL, solved
@@ -61,7 +63,8 @@ def unmodelled_errors(
     random = moved(chain, every, rows)
     rows = np.concatenate([rows[:count], waved(random[1], units.joints), rows[-1:]])
     products = np.array([gram(rows[:, part_of == k]) for k in range(len(used))])
-    turns, tilts, waves, shown = _sizes(posterior, rows, part_of, products, random)
+    groups = configurations(units.joints)
+    turns, tilts, waves, shown = _sizes(posterior, rows, (part_of, groups), products, random)
     rest = [k for k, name in enumerate(names) if name in posterior.priors and k >= own]
     along = share * products.sum(axis=0)[:own, :-1]
     middle = along[:, rest] @ posterior.square[np.ix_(rest, rest)] @ along[:, rest].T
@@ -73,30 +76,32 @@ def unmodelled_errors(
 def _sizes(
     posterior: Posterior,
     rows: FloatArray,
-    part_of: Index,
+    owners: tuple[Index, Index],
     products: FloatArray,
     random: Sequence[FloatArray],
 ) -> tuple[float, float, float, bool]:
     """Return the sizes of turns, tilts and waves, and whether waves show.
 
-    From weighted rows (P + T + 1, c, n), those of T waves and the residual last, their `products`
-    by part, and rows of `random` turns and tilts.
+    From weighted rows (P + T + 1, c, n), those of T waves and the residual last, of parts (c,) and
+    configurations (n,), their `products` by part, and rows of `random` turns and tilts.
     """
+    part_of, groups = owners
     given = np.array([posterior.priors.get(name, np.inf) for name in posterior.names]) ** -2.0
     counts = np.bincount(part_of, rows.any(axis=0).sum(axis=1))
     none = np.zeros(len(rows) - 1 - len(given))
     offsets, precision = np.append(posterior.offsets, none), given
     for _ in range(SEVERAL):
-        variances = _variances(products, offsets, precision, counts)
+        variances, shift = _variances(products, offsets, precision, counts)
         if not variances.all():
             return 0.0, 0.0, TYPICAL['drive'], False
-        total = np.tensordot(1.0 / variances, products, 1)
-        matrix, vector = total[:-1, :-1], total[:-1, :-1] @ offsets + total[:-1, -1]
-        waves, found = _size_of_waves(matrix, vector, given)
+        left = rows[-1] - np.tensordot(shift, rows[: len(shift)], 1)
+        often = _shared(left, part_of, groups)
+        waves, found = _size_of_waves(*_equations(products, offsets, often * variances), given)
         if found is None:
             break
         precision = np.append(given, none + found**-2.0)
     own = np.s_[: len(precision)]
+    matrix, vector = _equations(products, offsets, variances)
     mean, root = solved(matrix[own, own], vector[own], precision)
     scale = np.sqrt(variances)[part_of, np.newaxis]
     left = rows[-1] + np.tensordot(offsets[own] - mean, rows[own], 1)
@@ -109,6 +114,14 @@ def _sizes(
     kernels += [each @ np.swapaxes(each, 1, 2) for each in (turned, tilted)]
     turn, tilt = _random(np.array(kernels), basis, residual[..., 0]).tolist()
     return turn, tilt, waves, found is not None
+
+
+def _equations(
+    products: FloatArray, offsets: FloatArray, variances: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the normal matrix and vector of all columns, for parts (K,) of such variances."""
+    total = np.tensordot(1.0 / variances, products, 1)
+    return total[:-1, :-1], total[:-1, :-1] @ offsets + total[:-1, -1]
 
 
 def _size_of_waves(
@@ -139,10 +152,11 @@ def _size_of_waves(
 
 def _variances(
     products: FloatArray, offsets: FloatArray, precision: FloatArray, counts: Index
-) -> FloatArray:
+) -> tuple[FloatArray, FloatArray]:
     """Return the variance (K,) of noise by part of so many rows; zero if nothing is left.
 
-    By the products of the first P columns, with the prior `precision` (P,) of their `offsets`.
+    By the products of the first P columns, with the prior `precision` (P,) of their `offsets`, and
+    their change (P,).
     """
     own = np.s_[: len(precision)]
     variances, pulled = np.ones(len(products)), offsets[own] * precision
@@ -153,9 +167,19 @@ def _variances(
         left = products[:, -1, -1] - 2.0 * products[:, -1, own] @ mean
         left += mean @ products[:, own, own] @ mean
         if not ((left > 0.0) & (taken < counts)).all():
-            return np.zeros(len(products))
+            return np.zeros(len(products)), mean
         variances = left / (counts - taken)
-    return variances
+    return variances, mean
+
+
+def _shared(left: FloatArray, part_of: Index, groups: Index) -> FloatArray:
+    """Return how many times (K,) the squares of residuals (c, n) grow if summed by group (n,).
+
+    Targets at one stop, and visits to it, share errors of the arm, and tell no more than one.
+    """
+    summed = np.array([(np.bincount(groups, row) ** 2).sum() for row in left])
+    ratio = np.bincount(part_of, summed) / np.bincount(part_of, (left**2).sum(axis=1))
+    return np.where(ratio > SUSPICIOUS, ratio, 1.0)
 
 
 def _random(kernels: FloatArray, basis: FloatArray, residual: FloatArray) -> FloatArray:
