@@ -221,7 +221,6 @@ def _polynomials(places: FloatArray, weights: FloatArray) -> FloatArray:
     """Return weighted polynomials (M, N), orthogonal, without mean, of total mean square 1."""
     total = max(float(weights @ weights), 1.0)
     centred = places - (weights**2 @ places) / total
-    centred /= max(float(np.sqrt((weights**2 @ centred**2).sum() / total)), DEGENERATE)
     pairs = combinations_with_replacement(centred.T, 2)
     terms = [np.ones(len(places)), *centred.T, *(one * other for one, other in pairs)]
     columns = weights * np.array(terms)

@@ -119,3 +119,5 @@ def test_places_in_a_plane_or_all_in_one_tell_less():
     assert len(rows) == 3 * 5
     (rows,) = bends([samples(replace(flat, positions=0.0 * flat.positions))])
     assert len(rows) == 0
+    (rows,) = bends([samples(replace(flat, positions=flat.positions + 1e3))])  # no less from afar
+    assert len(rows) == 27
