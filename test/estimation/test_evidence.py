@@ -11,7 +11,8 @@ from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.estimation import evidence
 from calib_ros.estimation.considered import considered
-from calib_ros.estimation.evidence import Posterior, _device, size_group
+from calib_ros.estimation.evidence import Posterior, _device, posterior_of, size_group
+from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.sizes import SPREAD, TYPICAL, Evidence
 from calib_ros.kinematics import effects, se3
@@ -142,6 +143,19 @@ def test_a_rival_is_of_the_size_that_the_data_tell(scale):
     assert (size < 0.1, 0.1 < size < 0.5, size > 0.5) == (scale == 0.0, scale == 0.25, scale > 1.0)
 
 
+def test_a_prior_tells_a_rival_as_much_as_a_measurement_of_zero():
+    root = np.array([[1.0, 0.5, 2.0], [0.0, 3.0, 1.0], [0.0, 0.0, 0.5]])
+    matrix, vector, row = root.T @ root, np.array([2.0, -1.0, 4.0]), np.diag([7.0, 0.0, 0.0])
+    odds = []
+    for whole, given in ((matrix, row), (matrix + row, 0.0 * row)):
+        usual, other = (
+            Evidence(whole, vector, np.diag(given), [None, 'length', 'scale'], sizes)
+            for sizes in ({'length': 1.0, 'scale': 0.1}, {'length': 1.0, 'scale': 4.0})
+        )
+        odds.append(other.against(usual, usual.most_probable(set())[0], set())[0])
+    assert odds[0] == pytest.approx(odds[1])
+
+
 def told(rng, size=3):
     names = ('base.x', 'elbow_joint.a', 'elbow_joint.theta')[:size]
     root = rng.normal(size=(size, size))
@@ -204,6 +218,16 @@ def test_the_expected_error_is_that_of_shift_and_covariance(rng):
     np.testing.assert_allclose(found.expected(q), expected, rtol=0, atol=1e-6)
     assert found.held('base.x') == 0.0
     assert found.held('elbow_joint.theta') == pytest.approx(found.covariance[2, 2] / 0.25)
+
+
+def test_a_fit_is_weighed_with_the_likeliest_sizes_alone():
+    _, _, fitted = fit(problem_of(arm(0), spread(0, count=10)))
+    found = posterior_of(fitted, 2.0, judging=False)
+    stds = np.array([found.priors.get(name, np.inf) for name in found.names])
+    whole = fitted.products[:-1, :-1] / 2.0**2 + np.diag(stds**-2.0)
+    left = found.covariance @ whole - np.eye(len(whole))
+    scale = np.sqrt(np.diag(whole))
+    np.testing.assert_allclose(left / scale * scale[:, np.newaxis], 0.0, atol=1e-6)
 
 
 def test_errors_are_of_one_size_by_group():
