@@ -124,7 +124,7 @@ class Problem(Shown):
         free = effects.coupled(self.chain)
         for k, value in self.chain.held.items():
             name, joint = self.chain.joint_names[k], observations.joints[:, k]
-            if k not in free and np.abs(joint - value).max(initial=0.0) > SCATTER:
+            if k not in free and (np.abs(joint - value) > SCATTER).any():
                 raise InputError(
                     f'{name} was at {joint.min():.4g} to {joint.max():.4g}, but both its limits '
                     f'are {value:.4g} in the chain file, and no coupling moves it'

@@ -215,11 +215,12 @@ def test_names_that_never_came_are_not_told_to_have_come():
 def test_equal_limits_that_are_none_are_refused(rng):
     assert parse_chain(dump_chain(CHAIN)).held == CHAIN.held == {3: 0.0, 4: 0.1}
     moved = CHAIN.random_joints(30, rng)
-    moved[:, 4] += 0.05
+    moved[:3, 4] += 0.05
     seen = measure(CHAIN, moved, rng)
     assert Problem(CHAIN, seen).free
     with pytest.raises(InputError, match=r'level_2 was at .*, but both its limits are 0'):
         Problem(replace(CHAIN, effects=()), seen)
+    assert Problem(replace(CHAIN, effects=()), seen.select(np.arange(0))).free
     stuck = SCARA.replace('lower="-3.0" upper="3.0"', 'lower="0.0" upper="0.0"')
     with pytest.raises(ConfigError, match=r'limits of joint "wrist" are equal.*leave them out'):
         chain_from_urdf(stuck)
