@@ -197,3 +197,23 @@ def test_an_arm_is_far_off_by_its_largest_errors_of_position_and_angle(share):
     half = 0.5 * share * trials.in_frames(problem, arm, problem.sets).error
     limits = {'largest_error': half, 'largest_angle': 3.0 * half / LEVER}
     assert (explained(replace(problem, **limits), far=True) is None) == (share > 1.0)
+
+
+@pytest.mark.parametrize(('what', 'largest'), [('rms_mm', 10.0), ('rms_mrad', 20.0)])
+@pytest.mark.parametrize('number', range(3))
+def test_errors_larger_than_those_of_faulty_arms_are_suspicious(what, largest, number):
+    limits = {'largest_error': 0.01, 'largest_angle': 0.02, 'largest_length': 0.1}
+    for share in (0.99, 1.01):
+        figures = [SimpleNamespace(rms_mm=0.0, rms_mrad=None) for _ in range(3)]
+        setattr(figures[number], what, share * largest)
+        before, after, fitted = figures
+        judged = SimpleNamespace(figures_of_all=(before, after), share_of_outliers=0.0)
+        result = SimpleNamespace(
+            converged=True,
+            refusals=(),
+            coupled=0.0,
+            validation=judged,
+            fitted=SimpleNamespace(figures_of_all=(fitted, None)),
+            parameters=(),
+        )
+        assert mistakes._suspicious(SimpleNamespace(**limits), result) == (share > 1.0)

@@ -95,6 +95,7 @@ def test_a_drift_is_compared_with_priors_as_they_are_known(monkeypatch):
     [
         ({}, 'before pose 5 of set 2 (stamp 3.500 s)'),
         ({'image': 2}, 'before image 3 of set 2 (stamp 3.500 s)'),
+        ({'set': 0}, 'before pose 5 (stamp 3.500 s)'),
         ({'stamp_ns': 7 * 10**9, 'set': 0}, 'before line 7 (if rows are in the order'),
         ({'stamp_ns': 7 * 10**9, 'image': 2}, 'before image 3 of set 2, line 7 (if rows are'),
         ({'stamp_ns': 10**15}, 'before pose 5 of set 2 (stamp 1000000.000 s)'),

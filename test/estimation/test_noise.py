@@ -6,14 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, UR10E, measured_arm
+from fits import NOISE, SIGMAS, UR10E, measured_arm
 from scipy import stats
 
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.estimation import noise as noise_module
 from calib_ros.estimation.leastsquares import Prior, System, minimise, stacked, triangular_factor
-from calib_ros.estimation.noise import noise_of
+from calib_ros.estimation.noise import Noise, noise_of
+from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.shared_errors import Shared
 from calib_ros.estimation.unmodelled import _variances
@@ -169,3 +170,24 @@ def test_the_noise_of_either_part_is_told_from_the_products_of_rows(rng):
         np.array(products), np.zeros(4), np.full(4, 1e-9), np.array([2000, 2000])
     )
     np.testing.assert_allclose(np.sqrt(found), [0.5, 3.0], rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ('noise', 'consistent', 'stated', 'expected'),
+    [
+        ((2.0, 0.5), False, {}, (2e-4, 5e-4)),
+        ((2.0, None), False, {}, (2e-4, 2e-3)),
+        ((2.0, 3.0), True, {}, (1e-4, 1e-3)),
+        # of another device: what the arm lacks is added, but nothing taken off
+        ((2.0, 0.5), False, dict(zip(SIGMAS, (3e-4, 5e-3), strict=True)), (12**0.5 * 1e-4, 5e-3)),
+    ],
+)
+def test_new_poses_have_the_sigmas_of_the_device_and_what_the_arm_lacked(
+    noise, consistent, stated, expected
+):
+    """Those stated then, 0.1 mm and 1 mrad, are also those of a device of which none are given."""
+    *_, seen = measured_arm(0, 5)
+    given = dict(zip(SIGMAS, (1e-4, 1e-3), strict=True))
+    found = Noise(*noise, consistent, 0.0, 0.0, (), given=given)
+    told = found.expected_in(Problem(UR10E, seen, **stated))
+    assert (told.sigma_position, told.sigma_orientation) == pytest.approx(expected)
