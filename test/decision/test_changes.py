@@ -86,6 +86,14 @@ def test_turns_count_where_those_of_the_target_are_known(names, free, lever, mon
     assert told == [lever]
 
 
+def test_play_shows_in_no_other_parameter():
+    names = [Parameter(joint.name, 'theta') for joint in UR10E.joints]
+    play = Parameter('elbow_joint', 'backlash')
+    taken, left = changes.gauged(UR10E.with_effects([play]), names, [play], True)
+    assert np.abs(taken).max() < 0.2  # equally often either way
+    assert left == pytest.approx(1.0, abs=0.05)
+
+
 @pytest.mark.parametrize(
     ('kind', 'size', 'times'),
     [

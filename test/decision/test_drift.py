@@ -15,7 +15,7 @@ from calib_ros.apply.simulation import measure
 from calib_ros.decision import drift as drift_module
 from calib_ros.decision.drift import Shifts, chance, chance_of_gain
 from calib_ros.decision.reasons import Rule
-from calib_ros.estimation.leastsquares import minimise
+from calib_ros.estimation.leastsquares import Prior, minimise
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import start_frames
 from calib_ros.identification.identification import identify, identify_model
@@ -188,6 +188,16 @@ class Stops:
 def test_the_chance_is_the_share_of_shifts_that_explain_as_much():
     assert chance(np.array([0.5, 0.1, 0.5, 0.7, 0.2])) == 0.5
     assert chance_of_gain(UR10E, ['base.x'], [], None) == 1.0
+
+
+def test_a_prior_keeps_what_is_added_from_explaining(monkeypatch):
+    monkeypatch.setattr(drift_module, 'chance', np.max)  # of the shares
+    seen, shares = session(0, 1.0, 'none', count=40, width=None), []
+    for sigma in (None, 1e-9):
+        prior = sigma and Prior(UR10E, {'elbow_joint.a': sigma})
+        system = replace(Problem(UR10E, seen, **SIGMAS).system([seen]), prior=prior)
+        shares.append(chance_of_gain(UR10E, ['base.x'], ['elbow_joint.a'], system))
+    assert shares[1] < 1e-6 * shares[0]
 
 
 def test_added_columns_explain_what_the_known_ones_leave_in_their_own_directions():

@@ -136,6 +136,7 @@ def test_what_rounding_gives_to_the_zero_of_a_joint(step, rng):
     """A value that most poses share hardly averages out."""
     q = UR10E.random_joints(40, rng)
     q[:, 1], q[:, 2] = step * np.round(q[:, 1] / step), step * np.repeat([0, 1, 3], [20, 10, 10])
+    q[:, 3] = step * np.repeat([0, 1], 20)  # two values tell no step
     problem = Problem(UR10E, measure(UR10E, q, rng))
     steps = rounded_joints(problem)
     assert steps == {'shoulder_lift_joint': step, 'elbow_joint': step}
