@@ -86,7 +86,9 @@ def test_a_known_place_of_a_device_does_not_tell_the_delay_of_its_stamps(held, r
     seen, speed = between(true, 60, rng, noise=NOISE), rng.uniform(-0.5, 0.5, (60, 6))
     late = replace(seen, joints=seen.joints + 4e-3 * speed, velocity=speed)
     chain = replace(UR10E, base=replace(true.base, fixed=True)) if held else UR10E
-    result = identify(Problem(chain, late, **SIGMAS))
+    problem = Problem(chain, late, **SIGMAS)
+    assert problem.model.base.delay == 0.0  # at first
+    result = identify(problem)
     assert result.chain.base.delay == pytest.approx(4e-3, abs=2e-4)
     assert result.accepted
     assert result.noise.consistent

@@ -13,6 +13,7 @@ from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.estimation import noise as noise_module
 from calib_ros.estimation.leastsquares import Prior, System, minimise, stacked, triangular_factor
+from calib_ros.estimation.levels import chance_of
 from calib_ros.estimation.noise import Noise, noise_of
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples
@@ -191,3 +192,11 @@ def test_new_poses_have_the_sigmas_of_the_device_and_what_the_arm_lacked(
     found = Noise(*noise, consistent, 0.0, 0.0, (), given=given)
     told = found.expected_in(Problem(UR10E, seen, **stated))
     assert (told.sigma_position, told.sigma_orientation) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize('rank', [1, 4])
+@pytest.mark.parametrize('freedom', [3.0, 40.0])
+def test_chance_is_that_of_f_or_of_its_limit(rank, freedom):
+    assert chance_of(9.0, rank, freedom) == pytest.approx(stats.f.sf(9.0 / rank, rank, freedom))
+    assert chance_of(9.0, rank, np.inf) == pytest.approx(stats.chi2.sf(9.0, rank), rel=1e-6)
+    assert chance_of(-1e-9, 0, freedom) == 1.0  # by rounding

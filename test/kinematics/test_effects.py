@@ -228,6 +228,9 @@ def test_a_group_without_what_it_goes_by_is_refused(group, lacking):
     *_, seen = measured_arm(0, 20)
     with pytest.raises(ConfigError, match=lacking):
         Problem(UR10E, seen, effects=(group,))
+    if 'backlash' in group:  # one session tells it
+        signed = replace(seen, approach=np.ones_like(seen.joints))
+        assert Problem(UR10E, seen, more=(signed,), effects=(group,)).model.effects
 
 
 @pytest.mark.parametrize(
