@@ -144,8 +144,10 @@ def _region(
     problem, freedom = fitted.problem, fitted.uncertainty.overall
     of = partial(region_of, sets=problem.sets, freedom=freedom, largest=problem.largest_error)
     region = of(posterior)
-    if region is None and posterior.scale and not problem.sigma_scale:
-        checked = replace(fitted, problem=replace(problem, sigma_scale=SCALE))
+    printed = all(each.pixels is not None for each in problem.sets)
+    finer = SCALE if printed else EXCEPTION * SCALE  # as of a tracker
+    if region is None and posterior.scale and not 0.0 < problem.sigma_scale <= finer:
+        checked = replace(fitted, problem=replace(problem, sigma_scale=finer))
         if of(with_doubts(posterior, checked, size, more, doubts)) is not None:
             return None, posterior.scale
     return region, 0.0

@@ -219,18 +219,21 @@ def test_a_scale_that_few_lengths_imitate_is_refused_where_it_does_harm(seed):
     assert 'more than sigma_scale allows' in refusal
 
 
-@pytest.mark.parametrize('scale', [5e-4, 2e-3])
-def test_a_scale_that_leaves_no_region_is_the_reason(scale):
+@pytest.mark.parametrize(
+    ('scale', 'error', 'sigma', 'checked'),
+    [(5e-4, 1e-4, 0.0, 1e-4), (2e-3, 1e-4, 0.0, 0.0), (2e-4, 5e-5, 1e-4, 1e-5)],
+)
+def test_a_scale_that_leaves_no_region_is_the_reason(scale, error, sigma, checked):
     """Where the device is checked the arm itself may be of another size, but hardly by 0.2 %."""
     rng = np.random.default_rng(0)
-    true = faulty(UR, Cell(length_error=1e-4, angle_error=2e-4), rng)
+    true = faulty(UR, Cell(length_error=error, angle_error=2.0 * error), rng)
     lengths = [n for n in UR.parameter_names if n.is_length and not UR.owns_frame(n)]
     true = true.with_offsets({n: scale * UR.value(n) for n in lengths})
     problem = Problem(UR, measure(true, UR.random_joints(60, rng), rng, 5e-5, 2e-4), **SIGMAS)
-    result = identify(problem)
+    result = identify(replace(problem, sigma_scale=sigma))
     assert [each.rule for each in result.refusals] == [Rule.SCALE]
     assert not any('alike' in each for each in result.remarks)
-    assert identify(replace(problem, sigma_scale=1e-4)).accepted == (scale < 1e-3)
+    assert identify(replace(problem, sigma_scale=checked or 1e-4)).accepted == bool(checked)
 
 
 @pytest.mark.parametrize(('count', 'named'), [(30, 0), (200, 100)])
