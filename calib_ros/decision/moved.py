@@ -43,10 +43,14 @@ class Step:
     apart: bool = False
     held: bool = False
     """Whether a frame that the chain file holds is wrong from the first pose on."""
+    slow: bool = False
+    """Whether it crept over the whole session, which harms if the arm imitates it."""
 
     @property
     def harmful(self) -> bool:
         """Tell whether the step spoils the fit: it mixes two arms, or describes a past one."""
+        if self.slow and self.share < 1.0:
+            return False
         return self.kind not in FRAMES or not self.unused
 
     def __str__(self) -> str:
@@ -70,7 +74,10 @@ class Step:
         if self.kind == 'joint':
             thing, of = f'the zero of {self.what}', ''
         text, more = f'{thing} moved {size}{of} before {where}', f' ({when})'
-        if self.kind in OF_THE_ARM:
+        if self.slow:
+            text = f'{thing} moved slowly, {size} over the session{of}'
+            more = '; if the poses follow an order, errors of the arm may look so: mix them'
+        elif self.kind in OF_THE_ARM:
             text, more = f'{thing} changed before {where}', f' ({when}): poses differ {size}'
         if self.kind == 'load':
             more += '; measure with one load, or fit only the poses before or only those after'

@@ -54,7 +54,9 @@ def find_step(fitted: Fitted, held: bool = False) -> Step | None:
     if found is None and fitted.noise.position >= SUSPICIOUS:
         scan, found = _searched(fitted, loaded=True)
     if found is not None:
-        return None if scan.drifts(found) else scan.described(found)
+        if scan.drifts(found):  # between the means of both halves
+            found = replace(found, size=2.0 * found.size, slow=True)
+        return None if found.slow and not found.stop else scan.described(found)
     found = plain.imitated(fitted)
     if found is not None and found.group.kind == 'joint' and fitted.robust.outliers.any():
         plain = _Scan(fitted, loaded=False, gross=False)  # a slip leaves no gross errors
@@ -109,6 +111,7 @@ class _Found:
     size: FloatArray
     share: float
     variance: float
+    slow: bool = False
 
 
 class _Scan:
@@ -232,6 +235,12 @@ class _Scan:
         groups = [each for each in groups if not each.held]
         trials = np.log(self._stops * len(self._groups))
         for group in groups:
+            rows, own = self._growing(group)
+            if group.kind in FRAMES and arm.gains(rows, own)[0] >= LEAST + trials:
+                odds, size = arm.against(rows[0], own[0])
+                if odds - trials > highest:
+                    highest = odds - trials
+                    found = _Found(group, self._stops // 2, size, 1.0, 0.0, slow=True)
             gains = arm.gains(*self._moving(group, every))
             k = int(np.argmax(gains))
             if gains[k] < LEAST + trials:
@@ -260,6 +269,17 @@ class _Scan:
         own = products[:, [self._added.index(name) for name in group.names]]
         columns = [self._names.index(name) for name in group.names]
         return own[:, :, [*range(self._fitted), -1]], own[:, :, columns]
+
+    def _growing(self, group: _Group) -> tuple[FloatArray, FloatArray]:
+        """Return products as `_moving` of moves that grow over the session, to 1 at its end."""
+        columns = [self._names.index(name) for name in group.names]
+        cross, own = np.zeros((len(columns), self._fitted + 1)), np.zeros((len(columns),) * 2)
+        for rows, numbers in zip(self._rows, self._numbers, strict=True):
+            moving = (rows[columns] * (numbers / self._stops)).reshape(len(columns), -1)
+            ends = np.concatenate([rows[: self._fitted], rows[-1:]])
+            cross += moving @ ends.reshape(len(ends), -1).T
+            own += moving @ moving.T
+        return cross[np.newaxis], own[np.newaxis]
 
     def _to_the_end(self, places: Index) -> FloatArray:
         """Return products (B, K, P + 1) of moved columns with all, from each stop to the end."""
@@ -344,6 +364,7 @@ class _Scan:
             image=None if seen.pixels is None else int(seen.images[sample]),
             apart=size <= most and _apart(joints, later),
             held=not found.stop,
+            slow=found.slow,
         )
 
 

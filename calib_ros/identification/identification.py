@@ -122,7 +122,7 @@ def _identified(
         coupled=share > 0.0,
         images=sum(distinct(s.images) for s in problem.sets if s.pixels is not None),
     )
-    own_behaviour = None if step else arms_own(fitted)
+    own_behaviour = None if step and not step.slow else arms_own(fitted)
     rounding = may_be_rounding(fitted, before.chain, coarse)
     refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None, scaled)
     result = replace(result, refusals=(*result.refusals, *refused))
