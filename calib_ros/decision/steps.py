@@ -55,8 +55,10 @@ def find_step(fitted: Fitted, held: bool = False) -> Step | None:
         scan, found = _searched(fitted, loaded=True)
     if found is not None:
         if scan.drifts(found):  # between the means of both halves
+            if not found.stop or fitted.problem.sets[found.group.sets[0]].socket:
+                return None
             found = replace(found, size=2.0 * found.size, slow=True)
-        return None if found.slow and not found.stop else scan.described(found)
+        return scan.described(found)
     found = plain.imitated(fitted)
     if found is not None and found.group.kind == 'joint' and fitted.robust.outliers.any():
         plain = _Scan(fitted, loaded=False, gross=False)  # a slip leaves no gross errors
@@ -272,14 +274,12 @@ class _Scan:
 
     def _growing(self, group: _Group) -> tuple[FloatArray, FloatArray]:
         """Return products as `_moving` of moves that grow over the session, to 1 at its end."""
-        columns = [self._names.index(name) for name in group.names]
-        cross, own = np.zeros((len(columns), self._fitted + 1)), np.zeros((len(columns),) * 2)
+        columns, whole = [self._names.index(name) for name in group.names], np.zeros(())
         for rows, numbers in zip(self._rows, self._numbers, strict=True):
-            moving = (rows[columns] * (numbers / self._stops)).reshape(len(columns), -1)
-            ends = np.concatenate([rows[: self._fitted], rows[-1:]])
-            cross += moving @ ends.reshape(len(ends), -1).T
-            own += moving @ moving.T
-        return cross[np.newaxis], own[np.newaxis]
+            moving = rows[columns] * (numbers / self._stops)
+            whole = whole + gram(np.concatenate([moving, rows[: self._fitted], rows[-1:]]))
+        own = len(columns)
+        return whole[np.newaxis, :own, own:], whole[np.newaxis, :own, :own]
 
     def _to_the_end(self, places: Index) -> FloatArray:
         """Return products (B, K, P + 1) of moved columns with all, from each stop to the end."""
