@@ -309,3 +309,13 @@ def test_a_calibration_does_not_hold_only_because_nothing_was_known_there(arm):
     errors = np.random.default_rng(0).normal(scale=1.3e-3, size=(40, 3))
     vague = replace(arm, region=replace(arm.region, square=1e6 * arm.region.square))
     assert verify(vague, [with_errors(arm, errors)], None).verdict == 'does not hold'
+
+
+def test_a_calibration_does_not_hold_where_the_nominal_arm_is_nearer(arm):
+    """However little is known there."""
+    unsure = replace(arm, unmodelled=arm.unmodelled._replace(waves=1.0))
+    sound = replace(UR, base=arm.chain.base, tool=arm.chain.tool)
+    found = verify(unsure, [measured(sound, UR.random_joints(40, np.random.default_rng(3)))], None)
+    before, after = (each.rms_mm for each in found.comparison.figures)
+    assert before < 0.3 * after
+    assert found.verdict == 'does not hold'

@@ -9,7 +9,7 @@ import pytest
 from fits import NOISE, SIGMAS, UR10E, measured_arm
 from scipy import stats
 
-from calib_ros import Observations, Problem, identify
+from calib_ros import Observations, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.estimation import noise as noise_module
 from calib_ros.estimation.leastsquares import Prior, System, minimise, stacked, triangular_factor
