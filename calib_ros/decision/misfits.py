@@ -12,29 +12,20 @@ from itertools import combinations
 import numpy as np
 from scipy import special
 
-from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.drift import gain_of
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.leastsquares import owners, stacked
-from calib_ros.estimation.levels import (
-    ALIKE,
-    LEAST_ASIDE,
-    NEARER,
-    SEVERAL,
-    SURE,
-    TELLING,
-    chance_of,
-)
-from calib_ros.estimation.observations import SOME_POSES, Observations, numbered
+from calib_ros.estimation.leastsquares import stacked
+from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING
+from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import SUSPICIOUS
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray, norms
+from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXCEPTION
 
 ADVICE = (
@@ -135,70 +126,6 @@ def explained_share(
         return 0.0
     gain, _, left = gain_of(rows.T @ rows, len(fitted))
     return gain / left if left > 0.0 else 0.0
-
-
-def jump(
-    fitted: Fitted, validation: Comparison | None
-) -> tuple[tuple[Reason, ...], tuple[Reason, ...]]:
-    """Return the reason to refuse an arm of which a joint jumps, or what to tell if it helps."""
-    found, figures = _jump(fitted), validation and validation.figures
-    clear = figures and figures[1].rms_mm < NEARER * figures[0].rms_mm
-    return ((), found) if clear else (found, ())
-
-
-def _jump(fitted: Fitted) -> tuple[Reason, ...]:
-    """Return where a joint reads otherwise than elsewhere, if that explains most of a misfit.
-
-    Between two values of the joint or beyond one, as of an encoder that lost counts. Nor must an
-    eccentric gear explain as much.
-    """
-    problem, chain, count = fitted.problem, fitted.chain, len(fitted.names)
-    most, pairs = (
-        SOME_POSES // len(problem.sets),
-        zip(problem.sets, fitted.robust.good, strict=True),
-    )
-    few = [each.spread(most, good) for each, good in pairs]
-    zeros, joints = [j.driven for j in chain.joints], np.concatenate([e.joints for e in few])
-    rows = problem.system(few).rows_of(chain, (*fitted.names, *zeros))
-    flat, own = stacked(rows), owners(rows)
-    freedom = len(flat) - count - 1
-    if fitted.noise.consistent or len(joints) <= 2 * LEAST_ASIDE or freedom < len(flat) // 3:
-        return ()
-    basis = np.linalg.qr(flat[:, :count])[0]
-    left = flat[:, -1] - basis @ (basis.T @ flat[:, -1])
-    begins, ends = np.triu_indices(len(joints) + 1, LEAST_ASIDE)
-    some = ends - begins <= len(joints) - LEAST_ASIDE
-    begins, ends = begins[some], ends[some]
-    found = []
-    for k, column in enumerate(flat[:, count:-1].T):
-        order, sums = np.argsort(joints[:, k]), np.zeros((len(joints) + 1, count + 2))
-        parts = column[:, np.newaxis] * np.column_stack([left, column, basis])
-        np.add.at(sums[1:], np.argsort(order)[own], parts)
-        within = np.cumsum(sums, axis=0)
-        within = within[ends] - within[begins]
-        alone = within[:, 1] - (within[:, 2:] ** 2).sum(axis=1)  # beside all parameters
-        seen = alone > EXCEPTION**2 * within[:, 1]
-        gain = np.where(seen, within[:, 0] ** 2 / np.where(seen, alone, 1.0), 0.0)
-        best = int(np.argmax(gain))
-        first, last = joints[order[[begins[best], ends[best] - 1]], k]
-        found.append((gain[best] / (left @ left), k, within[best, 0] / alone[best], first, last))
-    share, k, size, first, last = max(found)
-    squares = share / max(1.0 - share, ROUNDING) * freedom
-    name, known = chain.joint_names[k], [name for name, _ in chain.effects]
-    if share < EXPLAINED or len(ends) * len(found) * chance_of(squares, 1, freedom) > 1.0 - SURE:
-        return ()
-    waves = [n for n in effects.members(chain, 'eccentricity') if n.owner == name]
-    waves = [n for n in waves if n not in known]
-    eccentric = chain.with_effects([*known, *waves])
-    if waves and explained_share(problem, eccentric, fitted.names, waves) > share:
-        return ()
-    factor, unit = zeros[k].small_unit
-    text = (
-        f'{name} reads {factor * abs(size):.2g} {unit} {"less" if size > 0.0 else "more"} between '
-        f'{first:.3g} and {last:.3g} {zeros[k].unit} than elsewhere, which explains '
-        f'{100.0 * share:.0f} % of the residuals: check its encoder and its gear'
-    )
-    return (Reason(Rule.ENCODER, text),)
 
 
 def zero_of_distances(fitted: Fitted) -> tuple[Reason, ...]:

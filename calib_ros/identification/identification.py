@@ -21,7 +21,7 @@ from calib_ros.decision import mistakes, plausibility
 from calib_ros.decision.acceptance import oddities, refusals
 from calib_ros.decision.comparison import GroupVerdict, compare
 from calib_ros.decision.drift import chance_of_gain
-from calib_ros.decision.misfits import arms_own, jump, lacking, outliers_of, zero_of_distances
+from calib_ros.decision.misfits import arms_own, lacking, outliers_of, zero_of_distances
 from calib_ros.decision.region import Region, region_of
 from calib_ros.decision.result import Identification
 from calib_ros.decision.rounding import may_be_rounding, rounded_joints, rounding_errors
@@ -94,7 +94,7 @@ def _identified(
     uncertainty = fitted.uncertainty.with_part(moved).with_part(unmodelled.square)
     parameters = parameter_rows(fitted, structural, uncertainty)
     region, scaled = _region(fitted, posterior, size, more, doubts)
-    step, (harms, told) = find_step(fitted), jump(fitted, validation)
+    step = find_step(fitted)
     result = Identification(
         chain=chain,
         before=before.chain,
@@ -113,12 +113,12 @@ def _identified(
         world_frame=problem.world_frame,
         converged=before.converged and robust.fit.converged and robust.settled,
         chance=_chance(fitted, before.chain),
-        refusals=zero_of_distances(fitted) + harms,
+        refusals=zero_of_distances(fitted),
         posterior=posterior,
         region=region,
         weak=_weak(problem, parameters),
         step=step,
-        remarks=(*oddities(problem, step, coarse), *map(str, told)),
+        remarks=oddities(problem, step, coarse),
         coupled=share > 0.0,
         images=sum(distinct(s.images) for s in problem.sets if s.pixels is not None),
     )

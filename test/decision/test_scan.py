@@ -155,29 +155,3 @@ def test_places_are_apart_where_a_plane_explains_nearly_all_of_it(share, apart):
     rest = share * EXCEPTION * 6.0 / 7.0
     joints = np.sqrt(1.0 - rest) * (2.0 * after - 1.0) + np.sqrt(rest) * beside
     assert steps._apart(joints[:, np.newaxis], after) == apart
-
-
-@pytest.mark.parametrize(
-    ('errors', 'most', 'jump', 'wave', 'told'),
-    [
-        (0.3, 0.35, 3e-3, 0.0, 'refused'),
-        (5.0, 2.0, 1e-3, 0.0, 'told'),  # clearly better nevertheless
-        (1.0, 2.0, 0.0, 2e-3, ''),
-        (1.0, 2.0, 0.0, 0.0, ''),
-    ],
-)
-def test_a_joint_that_reads_otherwise_in_a_part_of_its_range_is_named(
-    errors, most, jump, wave, told
-):
-    """Local poses of such an arm were accepted, and made it worse elsewhere."""
-    rng = np.random.default_rng(1)
-    true = arm(rng, errors)
-    q = np.array([0.0, -1.0, 1.2, 0.0, 1.0, 0.0]) + rng.uniform(-most, most, (40, 6))
-    actual = q.copy()
-    actual[:, 1] += jump * (q[:, 1] > -0.95) + wave * np.sin(q[:, 1])
-    seen = replace(measure(true, actual, rng, *NOISE), joints=q)
-    result = identify(Problem(UR10E, seen, **SIGMAS))
-    found = [each for each in (*result.refusals, *result.remarks) if 'than elsewhere' in each]
-    assert bool(found) == bool(told)
-    assert all(each.startswith('shoulder_lift_joint reads ') for each in found)
-    assert result.accepted == (told != 'refused')
