@@ -275,7 +275,7 @@ def typical(problem):
 
 def verdict(problem, words, clean):
     """Return what a mistake leads to, in a word, and in a sentence if it is not named."""
-    found = mistakes.explained(problem)
+    found = mistakes.diagnose(problem)
     if found is None:
         if typical(problem) < FACTOR * clean:
             return 'same', ''
@@ -298,7 +298,7 @@ def of_real_robots(only, rows, as_json):
         problem = problem_of(name, session, chain)
         problem = fewer(problem, rows) if rows else problem
         columns.append(column)
-        found = mistakes.explained(problem)
+        found = mistakes.diagnose(problem)
         table.setdefault('nothing', {})[column] = ['silent' if found is None else str(found)]
         clean = typical(problem)
         for group, words, bad in spoilt(problem):
@@ -361,7 +361,7 @@ def of_clean_sets(count, first):
     begin = time.process_time()
     for seed in range(first, first + count):
         problem, what = clean_set(seed)
-        found = mistakes.explained(problem)
+        found = mistakes.diagnose(problem)
         if found is not None:
             alarms += 1
             print(f'{seed}: {what}: {found}')

@@ -41,7 +41,7 @@ from calib_ros.apply.candidates import Visibility, draw_candidates
 from calib_ros.apply.design import Design
 from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision.changes import Effects
+from calib_ros.decision.changes import ChangeColumns
 from calib_ros.estimation.leastsquares import System, minimise
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples
@@ -118,7 +118,7 @@ def bound(few, kind):
     def mean_square(matrix):
         return np.trace(seen @ np.linalg.inv(matrix)[np.ix_(rest, rest)] @ seen.T)
 
-    columns = Effects(chain, tuple(map(Parameter, names)))
+    columns = ChangeColumns(chain, tuple(map(Parameter, names)))
     ratios = []
     for _ in range(20):
         many = information(UR.random_joints(MANY, rng))

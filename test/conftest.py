@@ -30,7 +30,7 @@ def rng():
 @pytest.fixture
 def unsearched(monkeypatch):
     """Let no mistakes be looked for, which takes far longer than the identification."""
-    monkeypatch.setattr('calib_ros.decision.mistakes.explained', lambda *_, **__: None)
+    monkeypatch.setattr('calib_ros.decision.mistakes.diagnose', lambda *_, **__: None)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verdicts import each_in_words, likely, remarks, verification_report
+from calib_ros.report.verdicts import each_in_words, likely_rms, remarks, verification_report
 
 UR = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)
@@ -45,5 +45,5 @@ def verification_page(chain, sets, found):
 
 def in_words(found):
     """Return what screen and report say of a verification, a line each."""
-    rms = f'the RMS error over poses like these is {likely(found)}'
+    rms = f'the RMS error over poses like these is {likely_rms(found)}'
     return '\n'.join([*each_in_words(found), rms, *remarks(found)])

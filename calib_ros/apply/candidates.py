@@ -172,9 +172,11 @@ def iso_9283_poses(
     points = _Cubes(design.targets(middle), middle, corners)
     for part in (slice(6), slice(3)):
         edge = 0.02  # of the smallest cubes [m]
-        cubes = _at(design, visibility, points, edge, part)
+        cubes = _with_edge(design, visibility, points, edge, part)
         for factor in 1.3**0.5 ** np.arange(5):  # increasingly fine
-            while len((grown := _at(design, visibility, cubes, edge * factor, part)).centres):
+            while len(
+                (grown := _with_edge(design, visibility, cubes, edge * factor, part)).centres
+            ):
                 cubes, edge = grown, edge * factor
         if len(cubes.centres):
             break
@@ -200,7 +202,7 @@ def iso_9283_poses(
     return IsoPoses(joints, edge, part == slice(6))
 
 
-def _at(
+def _with_edge(
     design: Design, visibility: Visibility | None, cubes: _Cubes, edge: float, part: slice
 ) -> _Cubes:
     """Return the cubes that can have this edge [m]."""

@@ -123,13 +123,13 @@ def compensate(
     solution = follower.solve(command, approach, progress=progress)
     joints = np.clip(command + solution.change, follower.lower, follower.upper)  # rounding
     result = Compensation(**vars(solution), command=command, joints=joints)
-    result = refused(result, _outside(compensator, result))
-    result = refused(result, _unreached(compensator, result))
+    result = add_refusals(result, _outside(compensator, result))
+    result = add_refusals(result, _unreached(compensator, result))
     moves, changes = (
         np.abs(np.diff(each, axis=0)) for each in (result.command, result.correction)
     )  # NaN beside refused samples
     words = 'jumps by {:.4g} while the joints move by {:.4g} at most'
-    return refused(result, too_fast(compensator, changes, moves, words, first=1))
+    return add_refusals(result, too_fast(compensator, changes, moves, words, first=1))
 
 
 def in_words(compensator: Compensator, result: Compensation) -> str:
@@ -254,7 +254,7 @@ def too_fast(
     return found
 
 
-def refused(result: Compensation, more: Sequence[Refusal]) -> Compensation:
+def add_refusals(result: Compensation, more: Sequence[Refusal]) -> Compensation:
     """Return the result with further samples refused, their joint values NaN."""
     joints = result.joints.copy()
     joints[[refusal.sample for refusal in more]] = np.nan

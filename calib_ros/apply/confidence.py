@@ -34,7 +34,7 @@ from scipy import special
 
 from calib_ros.decision.comparison import Comparison
 from calib_ros.errors import InputError
-from calib_ros.estimation.configurations import successive
+from calib_ros.estimation.configurations import renumber
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.kinematics.se3 import FloatArray, Index, norms
 
@@ -63,7 +63,7 @@ def rms_interval(errors: FloatArray, group: Index) -> tuple[float, float]:
     Repeats in a configuration, by `group` (N,), share its error: those with shares w of the pairs
     tell as much as 1 / sum w^2 alike. With a single one the limits are (0, inf).
     """
-    number = successive(group)
+    number = renumber(group)
     moments, shares = moments_of(errors, number), np.bincount(number) / len(number)
     if len(moments) < 2:
         return 0.0, np.inf

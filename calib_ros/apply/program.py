@@ -14,8 +14,8 @@ from calib_ros.apply.compensation import (
     Compensation,
     Compensator,
     Refusal,
+    add_refusals,
     compensate,
-    refused,
     too_fast,
 )
 from calib_ros.errors import InputError, UnknownNameError
@@ -70,10 +70,10 @@ def compensate_program(
     velocities, accelerations = _derivatives(compensator, result, speeds, bends, approach)
     held = result.limited.any(axis=1) & ~np.isnan(result.joints).any(axis=1)
     reason = 'a joint is held at its limit, where its velocity is not defined'
-    result = refused(result, [Refusal(k, reason) for k in np.flatnonzero(held).tolist()])
+    result = add_refusals(result, [Refusal(k, reason) for k in np.flatnonzero(held).tolist()])
     swings = np.where(np.isnan(result.joints), 0.0, np.abs(velocities - speeds))
     words = 'moves at {:.4g} while the joints move at {:.4g} a second at most'
-    result = refused(result, too_fast(compensator, swings, np.abs(speeds), words))
+    result = add_refusals(result, too_fast(compensator, swings, np.abs(speeds), words))
     gaps = np.where(np.isnan(result.joints), np.nan, 0.0)
     return (
         replace(

@@ -119,7 +119,7 @@ class Verification(Shown):
     """Whether all measurements were taken at the joint values of the program as it was given."""
     odd: tuple[int, ...] = ()
     """Configurations without which the others would be within the limit."""
-    mistake: mistakes.Explained | None = None
+    mistake: mistakes.Diagnosis | None = None
     """What explains measurements that are further off than any arm."""
     step: Step | None = None
     """What moved during the measurement, if the arm exceeds the limit."""
@@ -235,7 +235,7 @@ def _compared(
         commanded = before.joint_values(commanded)
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
         arms = arm.before, arm.chain
-        found = [_meant(*arms, each.joints, commanded) for each in sets]
+        found = [_match_commands(*arms, each.joints, commanded) for each in sets]
         wanted = [replace(s, joints=q) for s, (q, _) in zip(sets, found, strict=True)]
         uncorrected = not any(corrected.any() for _, corrected in found)
     before, after = _in_new_frames(before, sets, fitted), _in_new_frames(after, wanted, fitted)
@@ -252,11 +252,11 @@ def _compared(
 
 def _mistake(
     arm: Calibration, sets: Sequence[Observations], error: float, angle: float
-) -> mistakes.Explained | None:
+) -> mistakes.Diagnosis | None:
     if error <= Settings.largest_error and angle <= Settings.largest_angle:
         return None
     problem = Problem(arm.before, sets[0], more=sets[1:])
-    found = mistakes.explained(problem, far=True) or mistakes.explained_alone(problem, arm.chain)
+    found = mistakes.diagnose(problem, far=True) or mistakes.diagnose_alone(problem, arm.chain)
     known = error > Settings.largest_error or (found and found.alone)  # else positions fit
     return found if known else None
 
@@ -374,7 +374,7 @@ def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
     return chain
 
 
-def _meant(
+def _match_commands(
     nominal: Chain, calibrated: Chain, joints: FloatArray, commanded: FloatArray
 ) -> tuple[FloatArray, Index]:
     """Return the commanded joint values (N, n) [rad or m] that belong to measured ones (N, n).

@@ -23,8 +23,8 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.files import boards
 from calib_ros.files.lenses import read_lens
-from calib_ros.files.loading import Loaded, of_bag, of_table
-from calib_ros.files.rows import identified as row_of
+from calib_ros.files.loading import Loaded, load_bag, load_table
+from calib_ros.files.rows import result_row as row_of
 from calib_ros.identification.age import refuse_older, years_since
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.identification.recalibrated import Recalibration
@@ -129,7 +129,7 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
         {
             'robot': found.calibration.chain.name,
             'new poses': f'{found.after.count}, each judged by the others',
-            'position error': words.change((found.before, found.after)),
+            'position error': words.rms_change((found.before, found.after)),
             '95 % interval': _intervals(found.comparison),
             'arm known to': f'{known} over the joint range (one sigma)',
         }
@@ -149,7 +149,7 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
 
 def _intervals(judged: Comparison | None) -> str:
     """Return the intervals of the RMS errors; empty where they are not known."""
-    likely = [words.between(judged, when) for when in (0, 1)]
+    likely = [words.rms_range_mm(judged, when) for when in (0, 1)]
     return f'RMS {" -> ".join(likely)} mm' if all(likely) else ''
 
 
@@ -174,9 +174,9 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settin
         return _detected(options, chain, settings, touched, screen), settings
     if source == 'table':
         found = inputs.table_of(options, options.csv, chain, settings, screen, options.eye_in_hand)
-        return of_table(found, chain, settings, **touched), settings
+        return load_table(found, chain, settings, **touched), settings
     bag = inputs.replayed_bag(options.measured, chain, settings, screen)
-    return of_bag(*bag, options.largest_loss), settings
+    return load_bag(*bag, options.largest_loss), settings
 
 
 def _source(options: argparse.Namespace) -> str:
@@ -294,16 +294,16 @@ def _rows(result: Identification) -> dict[str, str]:
     fitted, measured = f'{result.rank} parameters fitted', words.fitted_to(result)
     if effects:
         fitted += f', {of_them(effects, "effect")}'
-    corners, turn = words.change(figures, 'px'), words.change(figures, 'mrad')
+    corners, turn = words.rms_change(figures, 'px'), words.rms_change(figures, 'mrad')
     largest = f'{rounded(before.max_mm)} -> {rounded(after.max_mm)} mm'
     valid = result.region.in_words() if result.accepted and result.region is not None else ''
     proof = '' if result.validation else '; on the poses fitted: no proof'
     return {
         'robot': f'{result.chain.name}, {fitted}',
         'fitted to': measured,
-        'position error': f'{words.change(figures)}{proof}',
+        'position error': f'{words.rms_change(figures)}{proof}',
         '95 % interval': _intervals(result.validation),
-        'with outliers': words.change(judged.figures_of_all) if judged.outliers else '',
+        'with outliers': words.rms_change(judged.figures_of_all) if judged.outliers else '',
         'corners': corners,
         'orientation error': '' if corners else turn,
         'largest error': '' if corners or turn else largest,

@@ -31,7 +31,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from calib_ros import __version__
 from calib_ros.cli.commands import COMMANDS, add_options
 from calib_ros.cli.common import OF_REPORTS, refuse_alone
-from calib_ros.cli.screen import Screen, fitted, help_width, wrapped
+from calib_ros.cli.screen import Screen, help_width, wrap_line, wrapped
 from calib_ros.errors import CalibrationError, UnknownNameError, near, shortened, trouble
 
 WAY = (
@@ -150,7 +150,7 @@ class _Parser(argparse.ArgumentParser):
         if message.endswith(': --chain'):
             message += ' (calib_ros robots lists the arms supplied)'
         self.print_usage(sys.stderr)
-        text = fitted(f'{self.prog}: error: {message}', '  ', sys.stderr)
+        text = wrap_line(f'{self.prog}: error: {message}', '  ', sys.stderr)
         self.exit(2, f'{text}\nexample: {self.example.lstrip()}\n')
 
 

@@ -46,7 +46,7 @@ class Screen:
             return
         for line in text.splitlines() or ['']:
             indent = ' ' * (len(line) - len(line.lstrip()) + 2)
-            print(fitted(line, indent, sys.stdout), flush=True)
+            print(wrap_line(line, indent, sys.stdout), flush=True)
 
     def title(self, text: str, good: bool | None = None) -> None:
         """Print a verdict; the colour never says more than the words."""
@@ -81,13 +81,13 @@ class Screen:
         if self.quiet:
             self.reasons += [f'{text.removesuffix(":")} -> {step}' for step in steps[:1]]
             return
-        _print(_begun(text), '- ')
+        _print(_capitalise(text), '- ')
         for k, step in enumerate(steps):
-            _print(_begun(step), f'  {k + 1}. ' if len(steps) > 1 else '  -> ')
+            _print(_capitalise(step), f'  {k + 1}. ' if len(steps) > 1 else '  -> ')
 
     def warn(self, text: str, kind: str = 'warning') -> None:
         """Print a warning; to a file as one line."""
-        line = fitted(f'{kind}: {text}', '  ', sys.stderr)
+        line = wrap_line(f'{kind}: {text}', '  ', sys.stderr)
         console = self._bar or _console(sys.stderr)
         if console is not None:
             console.print(_rich_text(line, 'yellow'))
@@ -150,7 +150,7 @@ class Work(Progress):
                     break
 
 
-def _begun(text: str) -> str:
+def _capitalise(text: str) -> str:
     """Return a text whose first word, but no name of the input, begins with a capital."""
     return re.sub(r'\A[a-z](?=[a-z]*:? )', lambda letter: letter[0].upper(), text)
 
@@ -188,7 +188,7 @@ def _printable(text: str) -> str:
     return ''.join(c if c.isprintable() or c == '\n' else '?' for c in text)
 
 
-def fitted(line: str, indent: str, stream: TextIO) -> str:
+def wrap_line(line: str, indent: str, stream: TextIO) -> str:
     """Return a line wrapped for a terminal; in a file it stays one."""
     return wrapped(line, '', indent, _width(stream)) if stream.isatty() else _printable(line)
 

@@ -15,7 +15,7 @@ from calib_ros.atomic import whole_folder, write_files
 from calib_ros.cli import common, inputs
 from calib_ros.cli.identify import RESULT_FILES, Identified, result_files, show
 from calib_ros.cli.screen import Screen
-from calib_ros.files.loading import of_bag
+from calib_ros.files.loading import load_bag
 from calib_ros.files.recording import Recording, write_bag
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import chain_text, dump_chain, load_chain, parse_chain
@@ -38,7 +38,7 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         screen.say(f'1. simulating an arm with known errors: {options.out / "bag"}')
         truth = _write_simulation(chain, options, bag, screen)
         screen.say('2. reading the recording as if from a real cell')
-        loaded = of_bag(*inputs.replayed_bag(bag, chain, settings, screen))
+        loaded = load_bag(*inputs.replayed_bag(bag, chain, settings, screen))
         screen.say('3. identifying the errors')
         configuration = documents.configuration_yaml(options.chain, settings)
         origin = inputs.origin_of(options, [bag], configuration)

@@ -16,7 +16,7 @@ from calib_ros.errors import InputError
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.programs import read_joints
-from calib_ros.files.rows import verified
+from calib_ros.files.rows import verification_row
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
@@ -25,7 +25,7 @@ from calib_ros.report import verdicts
 from calib_ros.report.documents import verification_document
 from calib_ros.report.page import markdown
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.words import change
+from calib_ros.report.words import rms_change
 from calib_ros.sampling.dataset import dataset_of
 from calib_ros.shown import rounded
 from calib_ros.texts import dump_json
@@ -66,7 +66,7 @@ def _verified(
             wanted = None if commanded is None else commanded.tolist()
             judged_by = (table_hash(arm.chain), options.tolerance, confidence, *moved, wanted)
             about = inputs.filing_of(options, nominal, sets, unread, *judged_by)
-            history.file(verified(arm.chain, found, about))
+            history.file(verification_row(arm.chain, found, about))
 
     for warning in warnings:
         screen.warn(warning)
@@ -105,10 +105,10 @@ def show(found: Verification, screen: Screen) -> None:
     screen.table(
         {
             'measured': f'{after.count:,} times at {found.configurations:,} poses',
-            'position error': change((before, after)),
+            'position error': rms_change((before, after)),
             'largest': f'{rounded(before.max_mm)} -> {rounded(after.max_mm)} mm',
-            'orientation error': change((before, after), 'mrad') or 'not measured',
-            'poses like these': f'RMS {verdicts.likely(found)}',
+            'orientation error': rms_change((before, after), 'mrad') or 'not measured',
+            'poses like these': f'RMS {verdicts.likely_rms(found)}',
             'tolerance': tolerance,
             'limit': limit,
         }

@@ -42,7 +42,7 @@ def refusals(
     the verdict of `rounding.py`, `sized` tells whether the measurements fix the size and shape of
     the arm, and `scaled` is the error of the device's scale if that alone leaves no region.
     """
-    failed = [*_of_the_fit(problem, result, own_behaviour)]
+    failed = [*_fit_refusals(problem, result, own_behaviour)]
     validation = result.validation
     if validation is None:
         text = 'too few poses to hold some out and test the result on them'
@@ -56,16 +56,16 @@ def refusals(
             'predictions do not belong together'
         )
         return (*failed, Reason(Rule.OUTLIERS, text))
-    gained = tuple(_of_the_gain(problem, result, validation, sized, scaled))
+    gained = tuple(_gain_refusals(problem, result, validation, sized, scaled))
     before, after = validation.figures
     helps = after.rms_mm < before.rms_mm or all(each.rule is not Rule.GAIN for each in gained)
-    found = (*failed, *gained, *_of_harm(validation, may_be_rounding, helps))
+    found = (*failed, *gained, *_harm_refusals(validation, may_be_rounding, helps))
     # of a fit that explains nothing the parameters tell nothing
     nothing = after.rms_mm > max(1e3 * problem.largest_error, before.rms_mm / ALIKE)
     return tuple(sorted(found, key=lambda each: nothing and each.rule is Rule.COMMON_SENSE))
 
 
-def _of_the_fit(
+def _fit_refusals(
     problem: Problem, result: Identification, own_behaviour: str | None
 ) -> Iterator[Reason]:
     """Yield failed rules that do not depend on held-out poses."""
@@ -80,7 +80,7 @@ def _of_the_fit(
         for each in missing:
             kinds.setdefault(each.owner, []).append(each.kind)
         named = ', '.join(f'{owner} ({", ".join(names)})' for owner, names in kinds.items())
-        yield Reason(Rule.EXCITATION, f'{_together(problem)}the poses do not determine {named}')
+        yield Reason(Rule.EXCITATION, f'{_idle_joints(problem)}the poses do not determine {named}')
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
         far = some([f'{p.name} by {_far(p, problem.largest_angle)}' for p in beyond])
@@ -97,7 +97,7 @@ def _far(parameter: ParameterRow, largest: float) -> str:
     return f'{math.degrees(turned if abs(turned) > largest else offset):.3g}°'
 
 
-def _together(problem: Problem) -> str:
+def _idle_joints(problem: Problem) -> str:
     """Return which joints stood still, or only moved together, and a colon; empty if none."""
     joints = np.concatenate([each.joints for each in problem.sets])
     turns = problem.chain.forward(joints)[:, :3, :3]
@@ -127,7 +127,7 @@ def _gain(
     return log_gain(before, after, validation.after.configurations[which], *confidence)
 
 
-def _of_the_gain(
+def _gain_refusals(
     problem: Problem, result: Identification, validation: Comparison, sized: bool, scaled: float
 ) -> Iterator[Reason]:
     before, after = validation.figures
@@ -151,8 +151,9 @@ def _of_the_gain(
     elif result.chance is not None and result.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
-            'moved to other poses, errors are explained as well, as a slow drift would be, in '
-            f'{100.0 * result.chance:.0f} % of cases (limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
+            'a slow drift may explain the gain: moved to other poses, errors are explained just '
+            f'as well in {100.0 * result.chance:.0f} % of cases '
+            f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )
     elif scaled:
         printed = all(each.pixels is not None for each in problem.sets)
@@ -199,12 +200,12 @@ def percent(share: float) -> str:
     return np.format_float_positional(100.0 * share, 2, fractional=False, trim='-')
 
 
-def _of_harm(validation: Comparison, may_be_rounding: bool, helps: bool) -> Iterator[Reason]:
+def _harm_refusals(validation: Comparison, may_be_rounding: bool, helps: bool) -> Iterator[Reason]:
     if helps and validation.outliers:
         first, second = validation.figures_of_all
         gain, limit = _gain(validation, 'position', validation.counting, CERTAIN)
         limit = max(limit, _loss_by_chance(validation), COUNTS)
-        caused = second.rms_mm > first.rms_mm and _caused(validation)
+        caused = second.rms_mm > first.rms_mm and _causes_outliers(validation)
         if second.mean_mm > first.mean_mm or gain < -limit or caused:
             yield Reason(
                 Rule.GAIN_WITH_OUTLIERS,
@@ -243,7 +244,7 @@ def _loss_by_chance(validation: Comparison) -> float:
     return 0.5 * float(likely / max(means[0].mean(), 1e-300))
 
 
-def _caused(validation: Comparison) -> bool:
+def _causes_outliers(validation: Comparison) -> bool:
     """Tell whether the correction itself causes outliers, so that these are no gross errors.
 
     Gross errors e do not know the correction c: 2 e c, by which their squares before exceed those

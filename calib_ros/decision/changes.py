@@ -37,7 +37,7 @@ import numpy as np
 from scipy import linalg, special
 
 from calib_ros.decision.drift import inverse_root
-from calib_ros.estimation.identifiability import followed
+from calib_ros.estimation.identifiability import best_imitation
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SCALE, SEVERAL, chance_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.sizes import SPREAD
@@ -48,7 +48,7 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.settings import LEVER
 from calib_ros.shown import Shown
 
-FALSE = 0.5 * (1.0 - CERTAIN)
+FALSE_ALARM = 0.5 * (1.0 - CERTAIN)
 """False alarms of an unchanged arm: one side of CERTAIN (benchmarks/recalibration.py)."""
 LIKELY = float(special.ndtri(0.5 + 0.5 * CONFIDENT))
 """Half of a 95 % interval in standard deviations."""
@@ -177,7 +177,7 @@ def root_of(square: FloatArray) -> FloatArray:
 
 
 def reasons_of(
-    information: Information, columns: Effects, freedom: float, most: float = FALSE
+    information: Information, columns: ChangeColumns, freedom: float, most: float = FALSE_ALARM
 ) -> tuple[Explanation, ...]:
     """Return the best explanation of a change, and those indistinguishable from it.
 
@@ -204,7 +204,7 @@ def reasons_of(
 
 def _explanation(
     information: Information,
-    columns: Effects,
+    columns: ChangeColumns,
     freedom: float,
     owner: str,
     names: tuple[Parameter, ...],
@@ -219,7 +219,7 @@ def _explanation(
 
 def likelier(
     information: Information,
-    columns: Effects,
+    columns: ChangeColumns,
     freedom: float,
     changed: list[tuple[Explanation, ...]],
 ) -> list[tuple[Explanation, ...]]:
@@ -262,7 +262,7 @@ def _sizes(names: Sequence[Parameter]) -> FloatArray:
     return np.array([known.get(name.unit) or expected(name) for name in names])
 
 
-class Effects:
+class ChangeColumns:
     """Effects of an arm's changes on the P parameters `names` with information.
 
     Changes of others show in these if they are gauge freedoms beside them, otherwise not at all.
@@ -279,7 +279,7 @@ class Effects:
     ) -> None:
         every = [name for joint in chain.joint_names for name in parameters_of(joint, DH_KINDS)]
         every += (name for frame in frames for name in parameters_of(frame))
-        mapped, left = gauged(chain, names, every, free=not frames)
+        mapped, left = gauge_map(chain, names, every, free=not frames)
         shows = np.abs(mapped).max(axis=0, initial=0.0)
         seen = (shows > HALF_THE_DIGITS) & (left < HALF_THE_DIGITS)
         self._columns = {n: c for n, c, yes in zip(every, mapped.T, seen, strict=True) if yes}
@@ -319,7 +319,7 @@ class Effects:
                     units[name] = unit
         return tuple(units)
 
-    def unscaled(self) -> Effects:
+    def unscaled(self) -> ChangeColumns:
         """Return the effects without another scale of the device."""
         found = copy.copy(self)
         found.sets = tuple(each for each in self.sets if each[1] != (SCALE_OF_DEVICE,))
@@ -352,7 +352,7 @@ class Effects:
         return found
 
 
-def gauged(
+def gauge_map(
     chain: Chain, names: Sequence[Parameter], others: Sequence[Parameter], free: bool
 ) -> tuple[FloatArray, FloatArray]:
     """Return how changes of other parameters show in the named ones, with `free` frames.
@@ -367,18 +367,20 @@ def gauged(
     approach = rng.choice([-1.0, 1.0], q.shape)
     turned = any(n.kind in FRAME_KINDS[3:] and not n.owner.startswith('base') for n in fitted)
     lever = LEVER if turned else 0.0  # positions do not show turns of the target
-    taken, wanted, left = followed(chain, fitted, others, q, lever, approach=approach)
+    taken, wanted, left = best_imitation(chain, fitted, others, q, lever, approach=approach)
     size = np.maximum(np.linalg.norm(wanted, axis=0), 1e-300)
     return taken[[fitted.index(name) for name in names]], np.linalg.norm(left, axis=0) / size
 
 
-def shown(chain: Chain, names: Sequence[Parameter], others: Sequence[Parameter]) -> FloatArray:
+def gauge_columns(
+    chain: Chain, names: Sequence[Parameter], others: Sequence[Parameter]
+) -> FloatArray:
     """Return the changes (P, K) of P named parameters in which unit changes of others show.
 
     A target at another height on a SCARA shows as a device at another height.
     """
     own = np.eye(len(names))[:, [name in others for name in names]]
-    mapped, left = gauged(chain, names, [n for n in others if n not in names], free=False)
+    mapped, left = gauge_map(chain, names, [n for n in others if n not in names], free=False)
     mapped = np.where(np.abs(mapped) > HALF_THE_DIGITS, mapped, 0.0)
     shows = (left < HALF_THE_DIGITS) & mapped.any(axis=0)
     return np.column_stack([own, mapped[:, shows]])
@@ -391,5 +393,5 @@ def mean_square_change(chain: Chain, names: Sequence[Parameter]) -> FloatArray:
     """
     joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
     frames = [*parameters_of('base'), *parameters_of('tool')]
-    _, _, left = followed(chain, frames, names, joints, 0.0)
+    _, _, left = best_imitation(chain, frames, names, joints, 0.0)
     return np.asarray(left.T @ left) / len(joints)

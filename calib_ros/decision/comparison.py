@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from calib_ros.estimation.configurations import successive
+from calib_ros.estimation.configurations import renumber
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.samples import residual_arrays, seen_residuals
@@ -201,7 +201,7 @@ def mean_squares(before: FloatArray, after: FloatArray, configurations: Index) -
     """Return the mean squared errors (2, K) of K configurations, for errors (N, 3) of pairs."""
     squares = np.stack([norms(before), norms(after)]) ** 2
     known = ~np.isnan(squares).any(axis=0)
-    group = successive(configurations[known])
+    group = renumber(configurations[known])
     return np.stack([np.bincount(group, row) for row in squares[:, known]]) / np.bincount(group)
 
 

@@ -62,7 +62,7 @@ class Imitation:
         spared = np.einsum('bkj,bk->bj', root, vector - along @ self._fit)
         return np.asarray(0.5 * (spared**2).sum(axis=1))
 
-    def against(self, products: FloatArray, own: FloatArray) -> tuple[float, FloatArray]:
+    def move_odds(self, products: FloatArray, own: FloatArray) -> tuple[float, FloatArray]:
         """Return the log odds of one move, and its size (K,); by products without B.
 
         Nothing speaks for a move that leaves the arm nearly as it is.
@@ -73,7 +73,7 @@ class Imitation:
         groups = [*self._groups, *['frame'] * len(cross)]
         still = Evidence(self._matrix, self._vector, self._given, self._groups, TYPICAL)
         moved = Evidence(matrix, np.append(self._vector, vector), given, groups, TYPICAL)
-        odds, mean, _ = moved.against(still, still.most_probable(set())[0], set())
+        odds, mean, _ = moved.odds_against(still, still.most_probable(set())[0], set())
         found, size = np.split(mean, [len(self._offsets)])
         off, far = (self._distance(each) for each in (self._offsets - found, found))
         return (odds if off > NEARER * far else -np.inf), size

@@ -16,9 +16,9 @@ from itertools import permutations, product
 import numpy as np
 
 from calib_ros.decision.suspects import reordered, rows_away
-from calib_ros.decision.trials import in_frames, largest_of, misses
+from calib_ros.decision.trials import in_frames, largest_of, sample_errors
 from calib_ros.decision.undoing import Sets, Suspect
-from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
@@ -59,14 +59,14 @@ def row_loss(
         found = in_frames(problem, nominal, (some,))
         tables = {s: np.full(count, np.inf) for s in SLIPS}
         for s, pairs in paired.items():
-            tables[s][inside[s]] = misses(found.chain, pairs, flange(found.chain, pairs))
+            tables[s][inside[s]] = sample_errors(found.chain, pairs, flange(found.chain, pairs))
         for before, after in product(SLIPS, SLIPS):
             if before and after:
                 continue
             row = _where(tables[before] <= largest, tables[after] <= largest)
             pieced = np.concatenate([tables[before][:row], tables[after][row:]])
             fitting = int(np.count_nonzero(pieced <= largest))
-            if fitting >= good and _apart(tables[before], tables[after], row, largest):
+            if fitting >= good and _sides_differ(tables[before], tables[after], row, largest):
                 good = fitting + 1
                 name = rows_in_words([row], seen.stamps_ns)
                 where = f'from {name} on' if after else f'before {name}'
@@ -93,7 +93,7 @@ def in_any_order(chain: Chain, seen: Observations, of_images: bool) -> Iterator[
         yield replace(found, remedy='correct it in --places') if of_images else found
 
 
-def dead(chain: Chain, sets: Sets) -> Suspect | None:
+def constant_axes(chain: Chain, sets: Sets) -> Suspect | None:
     """Return position coordinates that are constant although the arm moves.
 
     A device square to a planar arm measures no more.
@@ -126,7 +126,7 @@ def repeating(
     if seen.socket:
         return None
     arm = flange(chain, seen)
-    far = misses(chain, seen, arm) > largest
+    far = sample_errors(chain, seen, arm) > largest
     poses = np.column_stack([seen.given, seen.rotations.reshape(-1, 9)])
     for what, values, others in (
         ('the measurement is', poses, arm[:, :3, 3]),
@@ -167,7 +167,7 @@ def computed_rows(problem: Problem) -> str:
         if len(found) < 2 or found[1].error > largest_of(problem):
             continue
         if found[0].error < EXCEPTION**2 * found[1].error:
-            away = misses(found[0].chain, alone, flange(found[0].chain, alone))
+            away = sample_errors(found[0].chain, alone, flange(found[0].chain, alone))
             near = np.flatnonzero(away < EXCEPTION * found[1].error).tolist()
             return (
                 f'{rows_in_words(near, seen.stamps_ns, problem.of_messages)} fit the uncorrected '
@@ -179,7 +179,7 @@ def computed_rows(problem: Problem) -> str:
 
 def _covers(seen: Observations, least: FloatArray) -> bool:
     wide = bool((np.ptp(seen.joints, axis=0) >= least).all())
-    return wide and distinct(seen.configurations) > IN_A_FRAME
+    return wide and count_distinct(seen.configurations) > IN_A_FRAME
 
 
 def _where(before: Flags, after: Flags) -> int:
@@ -187,7 +187,7 @@ def _where(before: Flags, after: Flags) -> int:
     return int(np.argmax(np.concatenate([[0], np.cumsum(gain)])))
 
 
-def _apart(before: FloatArray, after: FloatArray, row: int, largest: float) -> bool:
+def _sides_differ(before: FloatArray, after: FloatArray, row: int, largest: float) -> bool:
     """Tell whether each side fits by its own shift and not by the other's."""
     sides = (before[:row], after[:row]), (after[row:], before[row:])
     return all(

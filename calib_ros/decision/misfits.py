@@ -47,7 +47,7 @@ class Outlier:
 def outliers_of(fitted: Fitted) -> tuple[Outlier, ...]:
     """Return the samples that a robust fit excludes."""
     robust = fitted.robust
-    sets = zip(fitted.problem.sets, robust.distances, robust.good, strict=True)
+    sets = zip(fitted.problem.sets, robust.distances, robust.inliers, strict=True)
     return tuple(
         Outlier(number, k, int(each.stamps_ns[k]), float(distances[k]))
         for number, (each, distances, good) in enumerate(sets)
@@ -105,7 +105,7 @@ def loose_target(sets: Sequence[Observations]) -> str:
     )
 
 
-def lacking(fitted: Fitted) -> float:
+def coupling_share(fitted: Fitted) -> float:
     """Return the share of the residuals that couplings of the wrist explain, if most of it."""
     problem, chain = fitted.problem, fitted.chain
     known = [name for name, _ in chain.effects]
@@ -160,7 +160,9 @@ def _constant(fitted: Fitted, wire: int) -> float:
     problem, names = fitted.problem, fitted.names
     sags = [n for n in effects.members(problem.chain, 'gravity') if n not in names]
     chain = fitted.chain.with_effects(sags)
-    sets = [each.select(good) for each, good in zip(problem.sets, fitted.robust.good, strict=True)]
+    sets = [
+        each.select(good) for each, good in zip(problem.sets, fitted.robust.inliers, strict=True)
+    ]
     longer = [*sets[:wire], _lengthened(sets[wire], 1.0), *sets[wire + 1 :]]
     rows, moved = (
         stacked(problem.system(each).rows_of(chain, (*names, *sags))) for each in (sets, longer)

@@ -19,21 +19,21 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from calib_ros.decision.lost_rows import dead, in_any_order, repeating, row_loss
+from calib_ros.decision.lost_rows import constant_axes, in_any_order, repeating, row_loss
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import FIRST, ORIENTATIONS, hidden, suspects
 from calib_ros.decision.trials import (
     Trial,
-    among,
     as_poses,
     fits_each_side,
     in_frames,
     largest_of,
-    misses,
-    refined,
+    misfit_set,
+    refine_trial,
+    sample_errors,
+    set_in_words,
     trial_of,
-    unlike,
 )
 from calib_ros.decision.undoing import Sets, Suspect
 from calib_ros.estimation.levels import (
@@ -60,7 +60,7 @@ Tries: TypeAlias = Sequence[tuple[Trial, Suspect]]
 
 
 @dataclass(frozen=True, eq=False)
-class Explained:
+class Diagnosis:
     """The mistakes that explain the measurements, and typical errors [m] with and without them.
 
     The latter is NaN if unknown. `where` names the set if others fit the arm.
@@ -107,7 +107,7 @@ def with_mistake(problem: Problem, result: Identification) -> Identification:
             rule = step.reason.rule
             first = sorted(result.refusals, key=lambda each: each.rule is not rule)
             return replace(result, refusals=tuple(first))
-        found = explained(problem)
+        found = diagnose(problem)
     if found is None:
         return result
     if result.refusals or found.alone:
@@ -134,7 +134,7 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
     return far or judged.share_of_outliers > MOST_OUTLIERS
 
 
-def explained(problem: Problem, far: bool = False) -> Explained | None:
+def diagnose(problem: Problem, far: bool = False) -> Diagnosis | None:
     """Return what explains the measurements much better than the given input, if anything.
 
     With `far` only if the arm as given, in its best frames, is further off than faulty arms.
@@ -142,7 +142,7 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
     sets = tuple(
         as_poses(problem, each)
         for each in problem.sets
-        if each.distances is None and _of_images(problem) == (each.pixels is not None)
+        if each.distances is None and _has_images(problem) == (each.pixels is not None)
     )
     if not sets or max(map(len, sets)) < IN_A_FRAME:
         return None  # base and tool alone explain nearly all of them
@@ -152,27 +152,27 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
     )
     chain, where = replace(problem.chain, base=base, tool=tool), ''
     if not any(each.socket for each in sets):
-        sets, where = unlike(problem, chain, sets)
+        sets, where = misfit_set(problem, chain, sets)
     given = in_frames(problem, chain, sets)
     if far and given.error <= largest_of(problem):
         return None
-    missing = None if _of_images(problem) else dead(chain, given.sets)
-    found = missing and Explained((missing,), given.error, np.nan)  # no change restores it
+    missing = None if _has_images(problem) else constant_axes(chain, given.sets)
+    found = missing and Diagnosis((missing,), given.error, np.nan)  # no change restores it
     found = found or _of_a_lost_row(problem, chain, sets, given)
     if not found:
-        tried = _tried(problem, chain, sets, given)
+        tried = _best_trials(problem, chain, sets, given)
         found = (
             _named(problem, given, tried)
-            or _of_repeats(problem, given.chain, _moved(problem, sets[0], 0))
-            or _by_places(problem, chain, sets, given, tried)
+            or _of_repeats(problem, given.chain, _shift_joints(problem, sets[0], 0))
+            or _wrong_rotations(problem, chain, sets, given, tried)
             or _in_some_rows(problem, chain, sets, given)
-            or _several(problem, chain, given)
+            or _beam_search(problem, chain, given)
             or _named(problem, given, tried, inexact=True)
         )
-    return found and _told(problem, replace(found, where=where + found.where))
+    return found and _for_messages(problem, replace(found, where=where + found.where))
 
 
-def _told(problem: Problem, found: Explained) -> Explained:
+def _for_messages(problem: Problem, found: Diagnosis) -> Diagnosis:
     """Return what explains the measurements with remedies for messages, if these were some."""
     if not problem.of_messages:
         return found
@@ -180,28 +180,30 @@ def _told(problem: Problem, found: Explained) -> Explained:
     return replace(found, suspects=named)
 
 
-def explained_alone(problem: Problem, chain: Chain) -> Explained | None:
+def diagnose_alone(problem: Problem, chain: Chain) -> Diagnosis | None:
     """Return what explains the measurements that a known chain misses by more than faulty arms."""
     sets = [each for each in problem.all_sets if each.distances is None and each.pixels is None]
     for each in sets:
         if found := _of_rows(problem, chain, each) or _of_repeats(problem, chain, each):
-            return _told(problem, replace(found, where=among(sets, each) + found.where))
+            return _for_messages(
+                problem, replace(found, where=set_in_words(sets, each) + found.where)
+            )
     return None
 
 
-def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | None:
+def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Diagnosis | None:
     """Return what explains the rows that a chain misses by more than faulty arms.
 
     Its frames hold for them too, so few rows tell as much as many.
     """
-    far = misses(chain, seen, flange(chain, seen)) > largest_of(problem)
+    far = sample_errors(chain, seen, flange(chain, seen)) > largest_of(problem)
     rows = np.flatnonzero(far)
     if len(rows) < LEAST_ASIDE:
         return None
     for name in (seen.base, seen.tool):
         chain = chain.with_frame(name, replace(chain.frame(name), fixed=True))
     given = trial_of(chain, (seen.select(rows).spread(),))
-    found = _named(problem, given, _tried(problem, chain, given.sets, given, of_rows=True))
+    found = _named(problem, given, _best_trials(problem, chain, given.sets, given, of_rows=True))
     if found is None or len(rows) == len(seen):
         return found
     poses = rows_in_words(rows.tolist(), seen.stamps_ns, problem.of_messages)
@@ -212,36 +214,36 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | 
     return replace(found, suspects=tuple(named), where=where)
 
 
-def _of_images(problem: Problem) -> bool:
+def _has_images(problem: Problem) -> bool:
     return any(each.pixels is not None for each in problem.sets)
 
 
-def _tried(
+def _best_trials(
     problem: Problem, chain: Chain, sets: Sets, given: Trial, of_rows: bool = False
 ) -> Tries:
     """Return the arm with the mistakes undone that explain most, the best first.
 
     With `of_rows` only mistakes made in each row alone.
     """
-    rough, of_images = [], _of_images(problem)
+    rough, of_images = [], _has_images(problem)
     likely = suspects(chain, given.sets, of_images)
     for each in (*likely, *in_any_order(chain, given.sets[0], of_images)):
         if of_rows and (each.chain is not None or not each.changes):
             continue
         few = given.sets
         if each.rows:
-            few = tuple(_moved(problem, one, each.rows).spread() for one in sets)
-        found = trial_of(each.chain or chain, each.undone(few))
+            few = tuple(_shift_joints(problem, one, each.rows).spread() for one in sets)
+        found = trial_of(each.chain or chain, each.undo_in(few))
         if found.share < given.share:
             rough.append((found, each))
     best = sorted(rough, key=lambda one: one[0].share)[:TRIED]
-    tried = [(refined(problem, found), each) for found, each in best]
+    tried = [(refine_trial(problem, found), each) for found, each in best]
     return sorted(tried, key=lambda one: one[0].share)
 
 
 def _named(
     problem: Problem, given: Trial, tried: Tries, inexact: bool = False
-) -> Explained | None:
+) -> Diagnosis | None:
     """Return the mistakes that explain the measurements best.
 
     With `inexact` the arm may be worse than faulty ones, if a tenth of the error is left at most.
@@ -259,37 +261,37 @@ def _named(
     named = [each for each in named if each.rank == lowest]
     named += [each for one, each in good if ALIKE * least < one.share <= least / NEARER]
     unlike = {(each.what, each.remedy): each for each in named}
-    return Explained(tuple(unlike.values())[:SEVERAL], given.error, best.error)
+    return Diagnosis(tuple(unlike.values())[:SEVERAL], given.error, best.error)
 
 
-def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:
+def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Diagnosis | None:
     """Return a row missing in one of two tables side by side, if that explains all."""
     if problem.of_messages or len(sets) > 1 or sets[0].socket or sets[0].pixels is not None:
         return None
-    found = row_loss(problem, chain, _moved(problem, sets[0], 0), largest_of(problem))
+    found = row_loss(problem, chain, _shift_joints(problem, sets[0], 0), largest_of(problem))
     if found is None:
         return None
     what, error = found
     remedy = 'is a row missing or duplicated in one of two tables? Correct it'
     # the typical error tells nothing if most rows are right
     corrected = error if error < NEARER * given.error else np.nan
-    return Explained((Suspect(what, remedy),), given.error, corrected)
+    return Diagnosis((Suspect(what, remedy),), given.error, corrected)
 
 
-def _of_repeats(problem: Problem, chain: Chain, seen: Observations) -> Explained | None:
+def _of_repeats(problem: Problem, chain: Chain, seen: Observations) -> Diagnosis | None:
     odd = repeating(chain, seen, largest_of(problem), problem.of_messages)
-    return None if odd is None else Explained((odd,), np.nan, np.nan)
+    return None if odd is None else Diagnosis((odd,), np.nan, np.nan)
 
 
-def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:
+def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Diagnosis | None:
     """Return what is wrong with some rows, if the arm explains the others.
 
     These may be nearly all rows, those clearly nearer than the rest, a third at one end of the
     session, or every second row.
     """
-    if len(sets) > 1 or sets[0].socket or _of_images(problem):
+    if len(sets) > 1 or sets[0].socket or _has_images(problem):
         return None
-    whole = _moved(problem, sets[0], 0)
+    whole = _shift_joints(problem, sets[0], 0)
     rows, third, sizes = np.arange(len(whole)), len(whole) // 3, norms(whole.given)
     order = np.sort(sizes)
     least = order[:-1].max(initial=0.0, where=order[1:] > CLEARLY * order[:-1])
@@ -309,32 +311,32 @@ def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> E
         'name them in a column session, and identify each alone (--session)',
         published='give each its own device in sources',
     )
-    return Explained((two,), given.error, np.nan)
+    return Diagnosis((two,), given.error, np.nan)
 
 
-def _by_places(
+def _wrong_rotations(
     problem: Problem, chain: Chain, sets: Sets, given: Trial, tried: Tries
-) -> Explained | None:
+) -> Diagnosis | None:
     """Return that the orientations are wrong, if the positions are explained."""
     whole = all(each.oriented.all() and not (each.socket or each.inverse) for each in sets)
-    if _of_images(problem) or not whole:
+    if _has_images(problem) or not whole:
         return None
     alone = tuple(replace(each, oriented=np.zeros(len(each), dtype=bool)) for each in sets)
     placed = in_frames(problem, chain, alone)
     if placed.error <= min(problem.largest_error, NEARER * given.error):
         known = placed.error + LEVER * problem.sigma_orientation
         enough = known < NEARER * given.error
-        return Explained((ORIENTATIONS,), given.error, placed.error) if enough else None
+        return Diagnosis((ORIENTATIONS,), given.error, placed.error) if enough else None
     if _named(problem, given, tried, inexact=True):
         return None  # with their orientations
-    found = _named(problem, placed, _tried(problem, chain, alone, placed))
+    found = _named(problem, placed, _best_trials(problem, chain, alone, placed))
     if found is None or len(found.suspects) > 1:
         return None
     what = f'{found.suspects[0].what}, and the orientations do not fit either'
     return replace(found, suspects=(replace(found.suspects[0], what=what),))
 
 
-def _several(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
+def _beam_search(problem: Problem, chain: Chain, given: Trial) -> Diagnosis | None:
     """Return simultaneous mistakes, each of which explains part of the errors.
 
     Beam search: another mistake is added to each of the best few, until the arm explains the rest
@@ -344,7 +346,7 @@ def _several(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
     if given.error <= problem.largest_error:
         return None
     few = given.sets
-    options = [each for each in suspects(chain, few, _of_images(problem)) if each.part]
+    options = [each for each in suspects(chain, few, _has_images(problem)) if each.part]
     largest, share = min(largest_of(problem), NEARER * given.error), NEARER * min(given.share, 1.0)
     least = given.share
     kept: list[tuple[Suspect, ...]] = [()]
@@ -354,20 +356,20 @@ def _several(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
         for these in together if number else [*together, *hidden(chain, options)]:
             if len({one.part for one in these}) == len(these):
                 more = tuple(sorted(these, key=lambda one: (*FIRST, one.part).index(one.part)))
-                trial = trial_of(chain, reduce(lambda sets, one: one.undone(sets), more, few))
+                trial = trial_of(chain, reduce(lambda sets, one: one.undo_in(sets), more, few))
                 found.setdefault(round(trial.share, 6), (trial, more))  # first of equivalent ones
         best = [found[key] for key in sorted(found)[:TRIED]]
         if not best or (number and best[0][0].share > CONFIDENT * least):
             return None
         least = best[0][0].share
-        polished = refined(problem, best[0][0])
+        polished = refine_trial(problem, best[0][0])
         kept = [these for _, these in best]
         if len(kept[0]) > 1 and polished.error <= largest and polished.share <= share:
-            return Explained((_together(kept[0]),), given.error, polished.error)
+            return Diagnosis((_merge_suspects(kept[0]),), given.error, polished.error)
     return None
 
 
-def _together(mistakes: Sequence[Suspect]) -> Suspect:
+def _merge_suspects(mistakes: Sequence[Suspect]) -> Suspect:
     published = [f'{each.what} ({each.published})' for each in mistakes]
     of_tables = [
         setting if 'chain file' in each.published else f'{each.what} ({each.remedy})'
@@ -377,7 +379,7 @@ def _together(mistakes: Sequence[Suspect]) -> Suspect:
     return Suspect(what, '; '.join(of_tables), published='; '.join(published))
 
 
-def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
+def _shift_joints(problem: Problem, each: Observations, rows: int) -> Observations:
     """Return measurements with the joint values `rows` below, held-out rows included."""
     same = [e for e in problem.judging if (e.base, e.tool) == (each.base, each.tool)]
     parts = [each, *(as_poses(problem, e) for e in same if e.distances is None)]

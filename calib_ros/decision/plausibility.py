@@ -25,7 +25,7 @@ from calib_ros.decision.region import SHELL
 from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.errors import CalibrationError, InputError
-from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, NEARER, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import SOME_POSES, Observations
@@ -53,7 +53,7 @@ COUPLED = (
 )
 
 
-def remarked(problem: Problem, result: Identification, another: bool = True) -> Identification:
+def add_remarks(problem: Problem, result: Identification, another: bool = True) -> Identification:
     """Return the result with what is suspicious in it, refused if it cannot be right.
 
     `another` is false if a mistake is already named, which comes first.
@@ -78,8 +78,8 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
         refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
         sigmas = ''
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
-    level, other = _level(problem, result), _another_type(problem, result) if another else ''
-    judged = _elsewhere(problem, result) if another else ''
+    level, other = _level_hand(problem, result), _another_type(problem, result) if another else ''
+    judged = _held_out_excess(problem, result) if another else ''
     loose, order = loose_target(problem.sets), _order(problem)
     found = (other, lens, board, judged, coupled, level, loose, motion, order, sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
@@ -99,7 +99,7 @@ def _scale(problem: Problem, result: Identification) -> Iterator[Reason]:
         yield Reason(Rule.SCALE, out_of_scale(found.scale, checked=bool(problem.sigma_scale)))
 
 
-def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
+def _arm_distance(chain: Chain, found: Chain, joints: FloatArray) -> float:
     """Return the RMS distance [m] of two arms at (N, n), in the best base and tool.
 
     Like arms need four steps; unlike ones, whose distance does not matter, hundreds.
@@ -151,7 +151,7 @@ def _another_type(problem: Problem, result: Identification) -> str:
     )
 
 
-def _level(problem: Problem, result: Identification) -> str:
+def _level_hand(problem: Problem, result: Identification) -> str:
     """Return that couplings which keep the hand level hide an unknown place of the target."""
     places = [p.name for p in result.parameters if p.status == 'gauge' and p.name.is_length]
     known = problem.chain.all_frames
@@ -184,7 +184,7 @@ def _motion(problem: Problem, result: Identification) -> str:
     return ''
 
 
-def _elsewhere(problem: Problem, result: Identification) -> str:
+def _held_out_excess(problem: Problem, result: Identification) -> str:
     """Return that held-out positions are further off than noise and expected errors make them."""
     sets, judged = problem.judging, result.validation
     if judged is None or judged.repeated is None:
@@ -233,7 +233,7 @@ def _lag(problem: Problem, result: Identification) -> Identification:
     if result.noise.position <= 1.0 or known:
         return result
     if all(each.velocity is None for each in problem.sets):
-        found = _behind(problem, result)
+        found = _stop_lag(problem, result)
     else:
         found = uneven(problem, result)
     if found is None:
@@ -244,7 +244,7 @@ def _lag(problem: Problem, result: Identification) -> Identification:
     return replace(result, remarks=(*result.remarks, text))
 
 
-def _behind(problem: Problem, result: Identification) -> tuple[str, Problem | None] | None:
+def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | None] | None:
     """Return that poses lie towards the previous stop, and the problem with that delay.
 
     Or that the joints have play, without a problem; None for images, or if neither explains most.
@@ -332,7 +332,7 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
     images: Counter[str] = Counter()
     for each in problem.sets:
         if each.pixels is not None:
-            images[each.camera] += distinct(each.images)
+            images[each.camera] += count_distinct(each.images)
     for camera, count in images.items():
         frame, names = problem.chain.frame(camera), parameters_of(camera, LENS_KINDS)
         freedom = IN_A_FRAME * count - len(result.names)
@@ -365,6 +365,7 @@ def _imitated(freed: Problem, result: Identification) -> bool:
         drawn = freed.chain.random_joints(SHELL, np.random.default_rng(0))
         joints.append(drawn[result.region.covers(drawn)])
     before, after = (
-        _apart(each, other, np.concatenate(joints)) for each in (result.before, result.chain)
+        _arm_distance(each, other, np.concatenate(joints))
+        for each in (result.before, result.chain)
     )
     return after > NEARER * before

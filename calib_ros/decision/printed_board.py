@@ -16,7 +16,7 @@ from scipy import special
 
 from calib_ros.decision.acceptance import percent
 from calib_ros.decision.result import Identification
-from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import LARGEST_SCALE, SURE
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
@@ -46,7 +46,7 @@ def stretched(problem: Problem, result: Identification) -> str:
     """Return that a board is certainly stretched along one side, in words."""
     for each, far in zip(problem.sets, result.distances, strict=True):
         kept = far < OUTLIER
-        if each.pixels is None or each.points is None or distinct(each.images[kept]) < 2:
+        if each.pixels is None or each.points is None or count_distinct(each.images[kept]) < 2:
             continue
         seen, points = each.select(kept), each.points[kept]
         _, shifts = seen_residuals(result.chain, seen)

@@ -23,8 +23,13 @@ from scipy import special
 
 from calib_ros.decision.drift import inverse_root
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.estimation.evidence import Mixed, Posterior
-from calib_ros.estimation.joint_errors import NOTHING, moved, moving, waved
+from calib_ros.estimation.evidence import MixtureTerm, Posterior
+from calib_ros.estimation.joint_errors import (
+    NOTHING,
+    axis_parameters,
+    turns_and_tilts,
+    wobble_columns,
+)
 from calib_ros.estimation.levels import KNOWN
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.samples import gram
@@ -139,7 +144,7 @@ def unpacked_matrix(rows: Sequence[str], size: int) -> FloatArray:
     return np.asarray(root @ root.T)
 
 
-def damaged(key: str, where: str, err: Exception | None = None) -> ConfigError:
+def damage_error(key: str, where: str, err: Exception | None = None) -> ConfigError:
     """Return the error for a damaged part of a record."""
     kind = '' if err is None else f' ({type(err).__name__})'
     return ConfigError(f'{where}: calibration.{key} is damaged{kind}: identify again')
@@ -176,9 +181,9 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
         what = f'{where}: calibration.region: {err.what}'
         raise UnknownNameError(what, err.name, err.alternatives) from err
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
-        raise damaged('region', where, err) from err
+        raise damage_error('region', where, err) from err
     if not (region.limit > 0.0 and 0.0 <= region.share <= 1.0):
-        raise damaged('region', where)
+        raise damage_error('region', where)
     return region
 
 
@@ -203,21 +208,21 @@ def region_of(
     order = np.argsort(far)
     own, inside = judge.products(rows[..., SOME_POSES:]), far[order] <= limit
     inner = own + judge.products(rows[..., order[inside]])
-    doubts = judge.of_the_arm(posterior.doubted)
-    if not max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts)) < RISK:
+    mixture = judge.of_the_arm(posterior.mixture)
+    if not max(judge.risk(own, own, mixture), judge.risk(inner, inner, mixture)) < RISK:
         return None
     shells = order[~inside & (far[order] <= largest)]
     for shell in np.split(shells, range(SHELL, len(shells), SHELL)):
         added = judge.products(rows[..., shell])
-        if not judge.risk(added, inner + added, doubts) < RISK:
+        if not judge.risk(added, inner + added, mixture) < RISK:
             break
         inner, limit = inner + added, float(far[shell[-1]])
     by_scale = 0.0
     if posterior.rival is not None:
         odds, mean, covariance = posterior.rival
         out = float(special.expit(odds))
-        doubts = judge.of_the_arm([(1.0, mean, covariance)])
-        by_scale = out * max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts))
+        mixture = judge.of_the_arm([(1.0, mean, covariance)])
+        by_scale = out * max(judge.risk(own, own, mixture), judge.risk(inner, inner, mixture))
     share = float(np.mean(far <= limit))
     if share == 1.0 and not any(joint.guessed for joint in posterior.chain.joints):
         limit = np.inf
@@ -225,7 +230,7 @@ def region_of(
     return Region(*arm, limit, share, *ends, by_scale)
 
 
-_Doubts: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+_Mixture: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """Weights (S,), means (S, A) and covariances (S, A, A) of the arm's A offsets."""
 
 
@@ -237,9 +242,9 @@ class _Judge:
         arm = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
         frames = [*parameters_of(base), *parameters_of(tool)[:3]]
         self._placed, self._freedom = len(frames), freedom
-        every = list(dict.fromkeys([*names, *frames, *moving(chain)]))
+        every = list(dict.fromkeys([*names, *frames, *axis_parameters(chain)]))
         self._model, self._waves = ErrorModel(chain, every, base, tool), posterior.unmodelled.waves
-        waves = range(len(posterior.doubted[0][1]) - len(names))
+        waves = range(len(posterior.mixture[0][1]) - len(names))
         self._arm = [*arm, *(len(names) + k for k in waves)]
         self._own = [*map(every.index, frames), *arm, *(len(every) + k for k in waves)]
         self._offsets = np.append(posterior.offsets[arm], np.zeros(len(waves)))
@@ -247,21 +252,21 @@ class _Judge:
     def rows(self, joints: FloatArray) -> FloatArray:
         """Return the columns (K, 3, N) of the posterior's names, of others, and of waves."""
         rows = self._model.jacobian(joints)[:, :3].transpose(2, 1, 0)
-        _, tilts = moved(self._model.chain, self._model.names, rows)
-        return np.concatenate([rows, self._waves * waved(tilts, joints)])
+        _, tilts = turns_and_tilts(self._model.chain, self._model.names, rows)
+        return np.concatenate([rows, self._waves * wobble_columns(tilts, joints)])
 
     def products(self, rows: FloatArray) -> FloatArray:
         """Return products (K, K) of the columns of frames, then of the arm, from all rows."""
         return gram(rows[self._own])
 
-    def of_the_arm(self, doubted: Sequence[Mixed]) -> _Doubts:
-        """Return plausible offsets and waves, as in `Posterior.doubted`, for the arm only."""
-        weights, means, covariances = zip(*doubted, strict=True)
+    def of_the_arm(self, mixture: Sequence[MixtureTerm]) -> _Mixture:
+        """Return plausible offsets and waves, as in `Posterior.mixture`, for the arm only."""
+        weights, means, covariances = zip(*mixture, strict=True)
         arm = np.ix_(self._arm, self._arm)
         own = np.array([each[arm] for each in covariances])
         return np.array(weights), np.array(means)[:, self._arm], own
 
-    def risk(self, which: FloatArray, around: FloatArray, doubts: _Doubts) -> float:
+    def risk(self, which: FloatArray, around: FloatArray, mixture: _Mixture) -> float:
         """Return the risk at some poses, in frames fitted to poses around; by their products."""
         frames, arm = np.s_[: self._placed], np.s_[self._placed :]
         root = inverse_root(around[frames, frames], np.diag(around)[frames])
@@ -269,7 +274,7 @@ class _Judge:
         pushed = which @ np.append(placed, self._offsets)
         slope = pushed[arm] - around[arm, frames] @ (root @ (root.T @ pushed[frames]))
         gain = float(slope @ self._offsets)
-        weights, means, covariances = doubts
+        weights, means, covariances = mixture
         margins = means @ slope - 0.5 * gain
         along = covariances.reshape(means.size, len(slope)) @ slope
         spreads = np.sqrt(np.maximum(along.reshape(means.shape) @ slope, 0.0))

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib_ros.decision.drift import gain_of
 from calib_ros.estimation.fitted import Fitted
-from calib_ros.estimation.leastsquares import owners, stacked
+from calib_ros.estimation.leastsquares import row_samples, stacked
 from calib_ros.estimation.levels import CLEARLY, SURE, chance_of
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.chain import Chain
@@ -71,7 +71,7 @@ def may_be_rounding(fitted: Fitted, before: Chain, steps: Mapping[str, float]) -
     `before` is the nominal chain with fitted frames, `steps` belong to rounded joints.
     """
     problem, names = fitted.problem, fitted.names
-    pairs = zip(problem.sets, fitted.robust.good, strict=True)
+    pairs = zip(problem.sets, fitted.robust.inliers, strict=True)
     sets = [each.spread(good=good) for each, good in pairs]
     joints = np.concatenate([each.joints for each in sets])
     levels = {}
@@ -86,7 +86,7 @@ def may_be_rounding(fitted: Fitted, before: Chain, steps: Mapping[str, float]) -
     chain = before.with_effects([name for name in arm if name in dict(problem.model.effects)])
     wanted = list(dict.fromkeys([*frames, *arm, *levels]))
     parts = problem.system(sets).rows_of(chain, wanted)
-    owner, rows = owners(parts), stacked(parts)
+    owner, rows = row_samples(parts), stacked(parts)
     columns = [rows[:, : len(frames)]]
     for name, level in levels.items():
         size = steps[Parameter(name).owner] / np.sqrt(12.0)

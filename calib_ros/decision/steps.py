@@ -239,7 +239,7 @@ class _Scan:
         for group in groups:
             rows, own = self._growing(group)
             if group.kind in FRAMES and arm.gains(rows, own)[0] >= LEAST + trials:
-                odds, size = arm.against(rows[0], own[0])
+                odds, size = arm.move_odds(rows[0], own[0])
                 if odds - trials > highest:
                     highest = odds - trials
                     found = _Found(group, self._stops // 2, size, 1.0, 0.0, slow=True)
@@ -252,7 +252,7 @@ class _Scan:
             rows, own = self._moving(group, self._to_the_end(np.arange(first, last + 1)))
             gains = arm.gains(rows, own)
             k = int(np.argmax(gains))
-            odds, size = arm.against(rows[k], own[k])
+            odds, size = arm.move_odds(rows[k], own[k])
             if np.isfinite(odds) and first + k in self._torn():
                 odds = float(gains[k])
             if odds - trials > highest:
@@ -362,13 +362,13 @@ class _Scan:
             share=found.share,
             unused=''.join(unused),
             image=None if seen.pixels is None else int(seen.images[sample]),
-            apart=size <= most and _apart(joints, later),
+            apart=size <= most and _separable(joints, later),
             held=not found.stop,
             slow=found.slow,
         )
 
 
-def _apart(joints: FloatArray, after: Flags) -> bool:
+def _separable(joints: FloatArray, after: Flags) -> bool:
     """Tell whether a plane separates joint values (N, n) by a mask (N,), nearly all of it."""
     centred, side = joints - joints.mean(axis=0), after - after.mean()
     left = side - centred @ np.linalg.lstsq(centred, side, rcond=None)[0]

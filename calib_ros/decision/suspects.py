@@ -18,13 +18,13 @@ from calib_ros.decision.undoing import (
     DataChange,
     Sets,
     Suspect,
-    in_axes,
-    joints_by,
-    lengths,
+    change_axes,
+    joint_map,
+    map_rotations,
     mirrored,
-    of_kind,
+    scale_joints,
+    scale_lengths,
     scaled,
-    with_turn,
 )
 from calib_ros.estimation.levels import NEARER
 from calib_ros.estimation.observations import Observations
@@ -69,7 +69,7 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
     """
     if of_images:
         yield from (replace(each, part='measured') for each in _of_boards(chain, sets[0]))
-        for each in _of_places(chain):
+        for each in _arm_mistakes(chain):
             remedy = each.published if 'chain' in each.published else 'correct it in --places'
             yield replace(each, remedy=remedy)
         return
@@ -88,16 +88,18 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
         remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
         what = 'the axes of the measuring device are left-handed'
         yield Suspect(what, remedy, (*back, mirrored, *back), 3, part='handed')
-    yield from _of_places(chain)
+    yield from _arm_mistakes(chain)
 
 
-def _of_places(chain: Chain) -> Iterator[Suspect]:
+def _arm_mistakes(chain: Chain) -> Iterator[Suspect]:
     """Yield mistakes of joint values and the arm."""
     for one, other, unit, size in MIXED_UP_UNITS:
         what = f'the joint values are in {one}, not {other}'
-        change = of_kind(chain, 'revolute', size)
+        change = scale_joints(chain, 'revolute', size)
         yield Suspect(what, f'--joint-angle {unit}', (change,), part='measured')
-    yield from _of_lengths('linear joints', _linear(chain), partial(of_kind, chain, 'prismatic'))
+    yield from _of_lengths(
+        'linear joints', _linear(chain), partial(scale_joints, chain, 'prismatic')
+    )
     yield from _of_joints(chain)
     yield from _of_one_unit(chain)
     yield from _of_arms(chain)
@@ -133,13 +135,13 @@ def _in_sources(on_flange: bool) -> str:
 def _units(chain: Chain) -> Iterator[Suspect]:
     """Yield units of lengths, and of angles at the same time."""
     whole = 'positions and linear joints' if _linear(chain) else 'positions'
-    degrees = of_kind(chain, 'revolute', np.radians(1.0))
+    degrees = scale_joints(chain, 'revolute', np.radians(1.0))
     for unit, name, size in UNITS:
         for way, option, factor in (
             (f'in {name}, not metres', f'--length {unit}', size),
             (f'in metres, not {name}', '--length m', 1.0 / size),
         ):
-            what, changes = f'the {whole} are {way}', lengths(chain, factor)
+            what, changes = f'the {whole} are {way}', scale_lengths(chain, factor)
             yield Suspect(what, option, changes)
             both = f'{what} and the joint values in degrees'
             yield Suspect(both, f'{option} --joint-angle deg', (*changes, degrees), 2)
@@ -168,7 +170,7 @@ def _of_coordinates(seen: Observations) -> Iterator[Suspect]:
             given = [f'{"-" * (n < 0)}{"xyz"[k]}' for n, k in zip(signs, order, strict=True)]
             option = '--columns x={},y={},z={}'.format(*given)
             what = f'the coordinates x, y, z of the positions are {", ".join(given)}'
-            changes = (*back, in_axes(matrix), *back)
+            changes = (*back, change_axes(matrix), *back)
             turned = bool(np.linalg.det(matrix) > 0.0)  # Euler angles' may look so
             if not np.array_equal(matrix, -np.eye(3)):  # as left-handed axes
                 yield Suspect(what, option, changes, 3 - turned, part='measured')
@@ -192,17 +194,23 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
         Suspect(
             'the quaternions are w x y z, not x y z w',
             '--quaternion wxyz',
-            (with_turn(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [1, 2, 3, 0]])), *back),
+            (
+                map_rotations(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [1, 2, 3, 0]])),
+                *back,
+            ),
         ),
         Suspect(
             'the quaternions are x y z w, not w x y z',
             '--quaternion xyzw',
-            (with_turn(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [3, 0, 1, 2]])), *back),
+            (
+                map_rotations(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [3, 0, 1, 2]])),
+                *back,
+            ),
         ),
         Suspect(
             'the rotations are transposed: they are of the device in the target',
             '--columns qx=-qx,qy=-qy,qz=-qz',
-            (with_turn(lambda turns: np.swapaxes(turns, 1, 2)), *back),
+            (map_rotations(lambda turns: np.swapaxes(turns, 1, 2)), *back),
         ),
     ]
     if back:
@@ -212,7 +220,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
         what = 'the poses are of the world in the target, as from a camera on the flange'
         remedy = '--eye-in-hand (or --inverse, where the device stands)'
         ways.append(Suspect(what, remedy, BACK, published=_in_sources(True)))
-    in_mm, degrees = lengths(chain, 1e-3), of_kind(chain, 'revolute', np.radians(1.0))
+    in_mm, degrees = scale_lengths(chain, 1e-3), scale_joints(chain, 'revolute', np.radians(1.0))
     for way in ways:
         yield replace(way, changes=(*back, *way.changes))
         for units, option, others in (
@@ -247,8 +255,8 @@ def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     largest = NEARER * max(away(seen), float(np.median(between)))
     back = BACK * seen.inverse
     for what, remedy, turn in misread():
-        found = Suspect(what, remedy, (*back, with_turn(turn), *back), 2)
-        if away(*found.undone((seen,))) < largest:
+        found = Suspect(what, remedy, (*back, map_rotations(turn), *back), 2)
+        if away(*found.undo_in((seen,))) < largest:
             yield found
 
 
@@ -265,7 +273,7 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
         what = f'{names[i]} and {names[j]} are swapped'
         remedy = f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}'
         published = 'swap them in joint_names, start without resume'
-        change = (joints_by(same[order]),)
+        change = (joint_map(same[order]),)
         yield Suspect(what, remedy, change, 2, published=published, part='order')
     last = len(names)
     orders = {'in the order from tool to base': [*range(last)][::-1]} if last > 3 else {}
@@ -277,20 +285,20 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
     ends = ((0, 'device moves'), (len(names) - 1, 'target does not move'))
     for k, stands in ends:
         what, remedy = f'the {stands} with {names[k]}', 'leave this joint out of the chain file'
-        still = joints_by(same - np.outer(same[k], same[k]))
+        still = joint_map(same - np.outer(same[k], same[k]))
         yield Suspect(what, f'{remedy}, or --columns q{k + 1}=0', (still,), published=remedy)
     for k in range(1, len(names)):
         for way in '+-' if revolute[k] and revolute[k - 1] else '':
             coupled = same + float(f'{way}1') * np.outer(same[k], same[k - 1])
             what = f'{names[k]} is not given against {names[k - 1]}: they are coupled'
             remedy = f'--columns q{k + 1}=q{k + 1}{way}q{k}'
-            yield Suspect(what, remedy, (joints_by(coupled),), 2, part=names[k])
+            yield Suspect(what, remedy, (joint_map(coupled),), 2, part=names[k])
 
 
 def reordered(what: str, places: Sequence[int], rank: int) -> Suspect:
     """Return that joint k is in another of the places (n,)."""
     columns = ','.join(f'q{k}=q{place + 1}' for k, place in enumerate(places, 1))
-    change = joints_by(np.eye(len(places))[[*places]])
+    change = joint_map(np.eye(len(places))[[*places]])
     published = 'set the order of joint_names, start without resume'
     return Suspect(what, f'--columns {columns}', (change,), rank, published=published)
 
@@ -311,7 +319,7 @@ def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
         name, column = chain.joint_names[k], f'q{k + 1}'
         for one, others, _, size in MIXED_UP_UNITS:
             what = f'{name} is in {one}, the other joints in {others}'
-            change = joints_by(np.diag(np.where(np.arange(len(chain.joints)) == k, size, 1.0)))
+            change = joint_map(np.diag(np.where(np.arange(len(chain.joints)) == k, size, 1.0)))
             remedy = f'--columns {column}={column}*{size:.9g}'
             yield Suspect(what, remedy, (change,), 2, part=name)
 
@@ -333,7 +341,7 @@ def _of_joint(chain: Chain, k: int) -> Iterator[Suspect]:
             yield Suspect(
                 f'{name} {" and ".join(whats)}',
                 f'{remedy}, or --columns {column}={given}',
-                (joints_by(np.diag(np.where(own, sign, 1.0)), angle * own),),
+                (joint_map(np.diag(np.where(own, sign, 1.0)), angle * own),),
                 len(whats),
                 published=remedy,
                 part=name,

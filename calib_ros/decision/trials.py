@@ -45,7 +45,7 @@ class Trial:
     def error(self) -> float:
         """Return the error [m] that a usual share of the samples is within."""
         pairs = zip(self.sets, self.arms, strict=True)
-        sizes = [misses(self.chain, each, arm) for each, arm in pairs]
+        sizes = [sample_errors(self.chain, each, arm) for each, arm in pairs]
         return _usual(np.concatenate(sizes))
 
     @property
@@ -63,7 +63,7 @@ def trial_of(chain: Chain, sets: Sets) -> Trial:
         known = chain.all_frames  # other robots have only a base and a tool
         own = replace(chain, base=known.get(each.base), tool=known.get(each.tool))
         best = _nearest(own, alone, arm, np.ones(len(alone), dtype=bool))
-        away = misses(best.chain, alone, arm)  # a gross error would hide a mistake
+        away = sample_errors(best.chain, alone, arm)  # a gross error would hide a mistake
         usual = away <= _usual(away)
         if np.count_nonzero(usual) >= 2 * IN_A_FRAME:  # base and tool explain fewer
             best = min(best, _nearest(own, alone, arm, usual), key=lambda one: one.error)
@@ -92,7 +92,7 @@ def as_poses(problem: Problem, each: Observations) -> Observations:
 
 def in_frames(problem: Problem, chain: Chain, sets: Sets) -> Trial:
     """Return the arm as given, in the frames that suit it best."""
-    return refined(problem, trial_of(chain, tuple(each.spread() for each in sets)))
+    return refine_trial(problem, trial_of(chain, tuple(each.spread() for each in sets)))
 
 
 def largest_of(problem: Problem) -> float:
@@ -115,7 +115,7 @@ def fits_each_side(problem: Problem, seen: Observations, stamp_ns: int) -> bool:
     return all(side.error <= largest_of(problem) for side in sides)
 
 
-def unlike(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
+def misfit_set(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
     """Return the largest set that the arm does not explain, and its name if it explains others.
 
     Another device or session may have other units or conventions.
@@ -126,10 +126,10 @@ def unlike(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
     worst = max(wrong or range(len(sets)), key=lambda k: len(sets[k]))
     if not 0 < len(wrong) < len(sets):
         return (sets[worst],), ''
-    return (sets[worst],), among(sets, sets[worst])
+    return (sets[worst],), set_in_words(sets, sets[worst])
 
 
-def among(sets: Sequence[Observations], one: Observations) -> str:
+def set_in_words(sets: Sequence[Observations], one: Observations) -> str:
     """Return which of several sets one is, by the frames that not all share."""
     if len(sets) == 1:
         return ''
@@ -145,12 +145,12 @@ def _nearest(chain: Chain, each: Observations, arm: FloatArray, rows: Flags) -> 
     return min((Trial(s, (each,), (arm,)) for s in starts), key=lambda one: one.error)
 
 
-def refined(problem: Problem, trial: Trial) -> Trial:
+def refine_trial(problem: Problem, trial: Trial) -> Trial:
     """Return the trial with frames refined by least squares on the samples near it."""
     chain, sets = trial.chain, trial.sets
     sigmas = problem.sigma_position, problem.sigma_orientation
     pairs = zip(sets, trial.arms, strict=True)
-    usual = [e.select(misses(chain, e, arm) <= CLEARLY * trial.error) for e, arm in pairs]
+    usual = [e.select(sample_errors(chain, e, arm) <= CLEARLY * trial.error) for e, arm in pairs]
     system = System(tuple(Samples(each, *sigmas) for each in usual))
     sockets = {each.base for each in sets if each.socket}
     every = movable(chain, dict.fromkeys(name for each in sets for name in (each.base, each.tool)))
@@ -161,7 +161,7 @@ def refined(problem: Problem, trial: Trial) -> Trial:
     return min(trial, polished, key=lambda one: one.error)
 
 
-def misses(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
+def sample_errors(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
     """Return the errors (N,) [m] of samples, given the poses (N, 4, 4) of the bare arm."""
     found = chain.frame(each.base).matrix @ arm @ chain.frame(each.tool).matrix
     left = each.positions - found[:, :3, 3]

@@ -38,26 +38,26 @@ class Suspect:
     published: str = 'correct the publisher and measure again (after ~/clear)'
     part: str = ''
 
-    def undone(self, sets: Sets) -> Sets:
+    def undo_in(self, sets: Sets) -> Sets:
         """Return the corrected samples."""
         for change in self.changes:
             sets = tuple(map(change, sets))
         return sets
 
 
-def joints_by(matrix: FloatArray, shift: FloatArray | float = 0.0) -> DataChange:
+def joint_map(matrix: FloatArray, shift: FloatArray | float = 0.0) -> DataChange:
     """Return the change of joint values by a matrix (n, n), then a shift (n,) or constant."""
     return lambda each: each.changed(joints=each.joints @ matrix.T + shift)
 
 
-def of_kind(chain: Chain, kind: str, size: float) -> DataChange:
+def scale_joints(chain: Chain, kind: str, size: float) -> DataChange:
     """Return the change of all joint values of a kind, 'revolute' or 'prismatic', by a factor."""
-    return joints_by(np.diag([size if joint.type == kind else 1.0 for joint in chain.joints]))
+    return joint_map(np.diag([size if joint.type == kind else 1.0 for joint in chain.joints]))
 
 
-def lengths(chain: Chain, size: float) -> tuple[DataChange, DataChange]:
+def scale_lengths(chain: Chain, size: float) -> tuple[DataChange, DataChange]:
     """Return what `--length` changes: positions and the values of prismatic joints."""
-    return scaled(size), of_kind(chain, 'prismatic', size)
+    return scaled(size), scale_joints(chain, 'prismatic', size)
 
 
 def scaled(size: float, axis: int | None = None) -> DataChange:
@@ -66,12 +66,12 @@ def scaled(size: float, axis: int | None = None) -> DataChange:
     return lambda each: each.changed(positions=sizes * each.positions)
 
 
-def in_axes(matrix: FloatArray) -> DataChange:
+def change_axes(matrix: FloatArray) -> DataChange:
     """Return the change of positions to the axes in the rows of a matrix (3, 3)."""
     return lambda each: each.changed(positions=each.positions @ matrix.T)
 
 
-def with_turn(turn: Turn) -> DataChange:
+def map_rotations(turn: Turn) -> DataChange:
     """Return the change of rotations by a function of these (N, 3, 3)."""
     return lambda each: each.changed(rotations=turn(each.rotations))
 

@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.decision.comparison import Comparison, Residuals, compare, joined, residuals
-from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.identifiability import drawn, independent_in
-from calib_ros.estimation.leastsquares import System, minimise, without_each
+from calib_ros.estimation.leastsquares import System, leave_fold_out, minimise
 from calib_ros.estimation.levels import TELLING
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.problem import Problem
@@ -37,7 +37,7 @@ def validate(
     repeated = _repeated(problem)
     if not repeated.all():
         comparison = replace(compare(before, fitted.chain, problem.judging), repeated=repeated)
-        if distinct(comparison.after.configurations[~repeated]) > 1:
+        if count_distinct(comparison.after.configurations[~repeated]) > 1:
             return _of_held_out(fitted, comparison, explained)
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
@@ -68,27 +68,28 @@ def _of_held_out(
 def _cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Comparison | None, str]:
     problem, names = fitted.problem, fitted.names
     groups = problem.configurations
-    count = distinct(np.concatenate(groups))
+    count = count_distinct(np.concatenate(groups))
     rows = sum(
-        distinct(group) * kind.rows for group, kind in zip(groups, problem.kinds, strict=True)
+        count_distinct(group) * kind.rows
+        for group, kind in zip(groups, problem.kinds, strict=True)
     )
-    folds = _folds(problem, names, count, rows)
+    folds = _fold_count(problem, names, count, rows)
     if folds < 2:
         return None, 'nothing: too few poses to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
     numbers = [group % folds for group in groups]
     chains = zip(
-        without_each(before, frames, fitted.system, numbers),
-        without_each(fitted.chain, names, fitted.system, numbers),
+        leave_fold_out(before, frames, fitted.system, numbers),
+        leave_fold_out(fitted.chain, names, fitted.system, numbers),
         strict=True,
     )
-    first, second = left_out(chains, problem.sets, groups, numbers)
+    first, second = fold_residuals(chains, problem.sets, groups, numbers)
     judged = Comparison(first, second, ~fitted.robust.outliers)
     over = f'{folds}-fold cross-validation over {count:,} different poses'
     return judged, f'{over}{note}{judged.omitted}'
 
 
-def left_out(
+def fold_residuals(
     chains: Iterable[tuple[Chain, Chain]],
     sets: Sequence[Observations],
     groups: Sequence[Index],
@@ -117,7 +118,7 @@ def _repeated(problem: Problem) -> Flags:  # held-out pairs (N,)
     return np.isin(np.concatenate(numbers[count:]), np.concatenate(numbers[:count]))
 
 
-def _folds(problem: Problem, names: Sequence[str], count: int, rows: int) -> int:
+def _fold_count(problem: Problem, names: Sequence[str], count: int, rows: int) -> int:
     """Return the number of folds; 0 if all configurations are needed for the fit.
 
     The other folds must determine the fit, with some equations to spare. If they do so only with

@@ -22,12 +22,12 @@ SCATTER = 0.02
 """Largest scatter [rad or m] of visits to one configuration (benchmarks/harm.py)."""
 
 
-def distinct(numbers: Index) -> int:
+def count_distinct(numbers: Index) -> int:
     """Return the number of different configurations in (N,)."""
     return int(np.count_nonzero(np.bincount(numbers)))
 
 
-def successive(numbers: Index) -> Index:
+def renumber(numbers: Index) -> Index:
     """Return configuration numbers (N,) in the same order, but without gaps."""
     return np.asarray((np.cumsum(np.bincount(numbers) > 0) - 1)[numbers])
 

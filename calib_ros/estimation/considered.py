@@ -21,7 +21,7 @@ import numpy as np
 from scipy import linalg
 
 from calib_ros.estimation.identifiability import DEGENERATE
-from calib_ros.estimation.joint_errors import NOTHING, Unmodelled, moving
+from calib_ros.estimation.joint_errors import NOTHING, Unmodelled, axis_parameters
 from calib_ros.estimation.leastsquares import System, products_of
 from calib_ros.estimation.levels import LARGEST_SCALE, OUT_OF_SCALE, PRINTED, SCALE
 from calib_ros.estimation.observations import SOME_POSES
@@ -67,12 +67,12 @@ def lenses(chain: Chain) -> dict[Parameter, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class Doubts:
+class Nuisances:
     """What else may move the measurements, each with a standard deviation.
 
     Parameters by `sizes` that something else moves too, all `lengths` together with the scale of
     the device, smooth errors of the device if `by_device`, and `unmodelled` waves beside what the
-    parameters follow of them; if `kept`, waves are no doubts but parameters, in units of their
+    parameters follow of them; if `kept`, waves are no nuisances but parameters, in units of their
     size.
     """
 
@@ -83,7 +83,7 @@ class Doubts:
     kept: bool = False
 
 
-class Doubted(NamedTuple):
+class NuisanceProducts(NamedTuple):
     """Products of columns and residual (Q, Q), and with K doubtful columns (Q, K) and (K, K).
 
     The columns are those of the parameters, of waves if kept, of the device's scale if there are
@@ -102,23 +102,23 @@ class Doubted(NamedTuple):
         return np.asarray(self.plain - self.cross @ taken)
 
 
-def doubted_products(
+def nuisance_products(
     chain: Chain,
     names: Sequence[str],
     system: System,
-    doubts: Doubts,
+    nuisances: Nuisances,
     noise: float = 1.0,
     most: int = 10 * SOME_POSES,
-) -> Doubted:
+) -> NuisanceProducts:
     """Return the products of a system, in units of `noise` [sigma given], without priors.
 
     Larger systems are thinned to `most` samples.
     """
-    waves = moving(chain) if doubts.unmodelled.waves else ()
-    columns = list(dict.fromkeys([*names, *doubts.lengths, *waves]))
+    waves = axis_parameters(chain) if nuisances.unmodelled.waves else ()
+    columns = list(dict.fromkeys([*names, *nuisances.lengths, *waves]))
     share = -(-system.count // most)
     few = system.spread(most)
-    products = share * _products(chain, columns, few, doubts)
+    products = share * _products(chain, columns, few, nuisances)
     extra = np.column_stack(system.separation_rows(chain, columns))
     own, count = len(columns) + 1, len(names)
     products[:own, :own] += extra.T @ extra
@@ -128,14 +128,16 @@ def doubted_products(
     def scaled(sizes: Mapping[str, float]) -> FloatArray:
         return every[:, [row[str(name)] for name in sizes]] * [*sizes.values()]
 
-    grown = scaled(doubts.lengths).sum(axis=1, keepdims=True)[:, : len(doubts.lengths)]
-    end = own + _waves(chain, doubts) * doubts.kept
+    grown = scaled(nuisances.lengths).sum(axis=1, keepdims=True)[:, : len(nuisances.lengths)]
+    end = own + _waves(chain, nuisances) * nuisances.kept
     kept = np.column_stack([every[:, :count], every[:, own:end], grown, every[:, own - 1]])
-    mixing = np.column_stack([kept, scaled(doubts.sizes), every[:, end:]])
+    mixing = np.column_stack([kept, scaled(nuisances.sizes), every[:, end:]])
     mixed = mixing.T @ (products / noise**2) @ mixing
     first, rest = np.s_[: kept.shape[1]], np.s_[kept.shape[1] :]
     doubtful = mixed[rest, rest]
-    return Doubted(mixed[first, first], mixed[first, rest], doubtful + np.eye(len(doubtful)))
+    return NuisanceProducts(
+        mixed[first, first], mixed[first, rest], doubtful + np.eye(len(doubtful))
+    )
 
 
 def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], float]:
@@ -163,16 +165,18 @@ def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], f
     return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}, scale
 
 
-def _waves(chain: Chain, doubts: Doubts) -> int:
-    return 8 * len(chain.joints) if doubts.unmodelled.waves else 0
+def _waves(chain: Chain, nuisances: Nuisances) -> int:
+    return 8 * len(chain.joints) if nuisances.unmodelled.waves else 0
 
 
-def _products(chain: Chain, columns: Sequence[str], system: System, doubts: Doubts) -> FloatArray:
+def _products(
+    chain: Chain, columns: Sequence[str], system: System, nuisances: Nuisances
+) -> FloatArray:
     """Return products of columns, residual, waves and smooth device errors."""
-    unmodelled = doubts.unmodelled
+    unmodelled = nuisances.unmodelled
     none = [np.zeros((0, samples.width, samples.count)) for samples in system.sets]
-    fields = bends(system.sets) if doubts.by_device else none
-    waves = _waves(chain, doubts)
+    fields = bends(system.sets) if nuisances.by_device else none
+    waves = _waves(chain, nuisances)
     if not (any(map(len, fields)) or waves):
         return np.asarray(products_of(chain, columns, system)[0].sum(axis=0))
     found = np.zeros((len(columns) + len(fields[0]) + waves + 1,) * 2)

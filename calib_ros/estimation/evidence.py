@@ -27,12 +27,12 @@ import numpy as np
 from scipy import special
 
 from calib_ros.estimation.considered import (
-    Doubted,
-    Doubts,
-    doubted_products,
+    NuisanceProducts,
+    Nuisances,
     held_frames,
     lengths_of,
     lenses,
+    nuisance_products,
 )
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
@@ -45,7 +45,7 @@ from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
-Mixed: TypeAlias = tuple[float, FloatArray, FloatArray]
+MixtureTerm: TypeAlias = tuple[float, FloatArray, FloatArray]
 """A weight, with mean (P,) and covariance (P, P) of the offsets."""
 
 
@@ -78,10 +78,10 @@ class Posterior(Shown):
     """(P, K), square root of the covariance that smooth errors of that device add."""
     priors: Mapping[str, float]  # standard deviation [m or rad] of parameters with a prior
     sizes: Mapping[str, float]  # size of the errors by group
-    doubted: tuple[Mixed, ...] = ()
+    mixture: tuple[MixtureTerm, ...] = ()
     """The posterior of the offsets, then of waves in units of their size, for each plausible set
     of sizes, if the device may have a scale error and rounded joint values may be off."""
-    rival: Mixed | None = None
+    rival: MixtureTerm | None = None
     """The same with log odds for a device out of scale, or further than `sigma_scale`; None of a
     printed board of unchecked scale, which may be."""
     scale: float = 0.0
@@ -122,7 +122,9 @@ class Posterior(Shown):
             device=np.pad(self.device, ((0, len(names)), (0, 0))),
         )
 
-    def with_held(self, each: Mixed, names: Sequence[str], slopes: FloatArray) -> Mixed:
+    def with_held(
+        self, each: MixtureTerm, names: Sequence[str], slopes: FloatArray
+    ) -> MixtureTerm:
         """Return mean (Q,) and covariance (Q, Q) with the K held names inserted before waves."""
         weight, mean, covariance = each
         count, own = len(names), len(self.names) - len(names)
@@ -132,7 +134,7 @@ class Posterior(Shown):
         covariance[: own + count, : own + count] += (along * self.stds_of(names) ** 2) @ along.T
         return weight, np.insert(mean, place, 0.0), covariance
 
-    def held(self, name: str) -> float:
+    def prior_share(self, name: str) -> float:
         """Return the share of a parameter's variance due to its prior, 1 if undetermined."""
         variance = float(self.covariance[self.names.index(name), self.names.index(name)])
         return variance / self.priors[name] ** 2 if name in self.priors else 0.0
@@ -154,7 +156,7 @@ def posterior_of(
     columns = _Columns(fitted, noise, more, rounding)
     evidence, arm, sums = columns.evidence(), columns.arm, columns.sums
     size, slope = evidence.most_probable(columns.considered)
-    near = evidence.near(size, slope) if judging else []
+    near = evidence.sigma_points(size, slope) if judging else []
     usual = zip(columns.names, evidence.precision(size).tolist(), strict=False)
     priors = {name: float(each**-0.5) for name, each in usual if each > 0.0}
     if judging:
@@ -172,7 +174,7 @@ def posterior_of(
     return posterior if fitted.held is None else posterior.held_at(*fitted.held)
 
 
-def with_doubts(
+def with_mixture(
     posterior: Posterior,
     fitted: Fitted,
     noise: float,
@@ -186,22 +188,22 @@ def with_doubts(
     columns = _Columns(fitted, noise, more, rounding, posterior.unmodelled.waves)
     evidence, arm, considered = columns.evidence(), columns.arm, columns.considered
     size, slope = evidence.most_probable(considered)
-    near = evidence.near(size, slope)
+    near = evidence.sigma_points(size, slope)
     rival, scale, checked = None, 0.0, bool(fitted.problem.sigma_scale)
     if columns.scaled and fitted.held is None and (checked or columns.scale < PRINTED):
         elsewhere = columns.evidence(max(OUT_OF_SCALE, columns.scale))
-        odds, mean, covariance = elsewhere.against(evidence, size, considered)
+        odds, mean, covariance = elsewhere.odds_against(evidence, size, considered)
         # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
         odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
         rival, scale = (odds, mean[arm], covariance[arm, arm]), float(mean[-1])
     evidence.widen(size)
     found = [(w, *solved(*columns.normal, evidence.precision(each))) for w, each in near]
-    doubted = [(w, mean[arm], root[arm] @ root[arm].T) for w, mean, root in found]
+    mixture = [(w, mean[arm], root[arm] @ root[arm].T) for w, mean, root in found]
     if fitted.held is not None:  # nothing measures the scale
-        doubted = [posterior.with_held(each, *fitted.held) for each in doubted]
+        mixture = [posterior.with_held(each, *fitted.held) for each in mixture]
     elif columns.scaled and rival is None:
         scale = float(found[0][1][-1])
-    return replace(posterior, doubted=tuple(doubted), rival=rival, scale=scale)
+    return replace(posterior, mixture=tuple(mixture), rival=rival, scale=scale)
 
 
 class _Columns:
@@ -225,9 +227,9 @@ class _Columns:
         whole, lengths, self.scale = self.chain, dict[str, float](), SCALE
         if more:
             whole, lengths, self.scale = lengths_of(self.chain, system)
-        doubts = Doubts(beside, lengths, bool(more), Unmodelled(waves=waves), kept=True)
+        nuisances = Nuisances(beside, lengths, bool(more), Unmodelled(waves=waves), kept=True)
         noise = max(noise, ROUNDING)  # parameters that follow all exactly leave none
-        self.sums = _sums_of(fitted, whole, self.names, doubts, noise)
+        self.sums = _sums_of(fitted, whole, self.names, nuisances, noise)
         self.scaled, count = bool(lengths), len(self.sums.plain) - 1
         self.arm = slice(0, count - self.scaled)  # with waves, in units of their size
         self.offsets = np.append(fitted.offsets, np.zeros(count - len(names)))
@@ -255,13 +257,13 @@ class _Columns:
 
 
 def _sums_of(
-    fitted: Fitted, whole: Chain, every: Sequence[str], doubts: Doubts, noise: float
-) -> Doubted:
-    """Return the products of columns for noise of a size, those of the fit if without doubts."""
-    if doubts.by_device or doubts.sizes or doubts.unmodelled.waves:
-        return doubted_products(whole, every, fitted.system, doubts, noise)
+    fitted: Fitted, whole: Chain, every: Sequence[str], nuisances: Nuisances, noise: float
+) -> NuisanceProducts:
+    """Return the products of columns for noise of a size, of the fit if without nuisances."""
+    if nuisances.by_device or nuisances.sizes or nuisances.unmodelled.waves:
+        return nuisance_products(whole, every, fitted.system, nuisances, noise)
     products = fitted.products / noise**2
-    return Doubted(products, products[:, :0], products[:0, :0])
+    return NuisanceProducts(products, products[:, :0], products[:0, :0])
 
 
 def _device(

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import special
 
 from calib_ros.estimation import identifiability
-from calib_ros.estimation.considered import Doubts, doubted_products
+from calib_ros.estimation.considered import Nuisances, nuisance_products
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import CONFIDENT, KNOWN
 from calib_ros.estimation.noise import Noise
@@ -52,7 +52,7 @@ class ParameterRow:
 
 
 @dataclass(frozen=True, eq=False)
-class Simpler:
+class SimplerFit:
     """Results of the fit of a simpler model, without effects."""
 
     chain: Chain
@@ -100,7 +100,7 @@ class Fitted:
     @cached_property
     def products(self) -> FloatArray:
         """Return the products (P + 1, P + 1) of its columns and the residual, without priors."""
-        return doubted_products(self.chain, self.names, self.system, Doubts()).plain
+        return nuisance_products(self.chain, self.names, self.system, Nuisances()).plain
 
 
 def parameter_rows(
@@ -108,7 +108,7 @@ def parameter_rows(
 ) -> tuple[ParameterRow, ...]:
     """Return every parameter of a fitted chain, with its standard deviation if fitted."""
     problem, chain, names = fitted.problem, fitted.chain, fitted.names
-    change = _to_values(chain, names)
+    change = _value_jacobian(chain, names)
     variances = np.einsum('vp,kpr,vr->kv', change, uncertainty.parts, change, optimize=True)
     std = dict(zip(names, np.sqrt(variances.sum(axis=0)).tolist(), strict=True))
     freedom = dict(zip(names, uncertainty.freedom_of(variances).tolist(), strict=True))
@@ -127,7 +127,7 @@ def parameter_rows(
     return tuple(rows)
 
 
-def _to_values(chain: Chain, names: Sequence[str]) -> FloatArray:
+def _value_jacobian(chain: Chain, names: Sequence[str]) -> FloatArray:
     """Return the derivative (P, P) of the values, which differ for rotation vectors of frames.
 
     A turn by w in the parent's axes changes the vector v = log R by J_l(v)^-1 w.

@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.evidence import posterior_of
-from calib_ros.estimation.fitted import Fitted, Simpler
+from calib_ros.estimation.fitted import Fitted, SimplerFit
 from calib_ros.estimation.leastsquares import System, factor_of, minimise, triangular_factor
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.noise import Noise, noise_of, squares_of
@@ -36,7 +36,9 @@ FOLLOWED = 2.0
 (benchmarks/real_robots.py)."""
 
 
-def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ...], Chain, Fitted]:
+def fit(
+    problem: Problem, simpler: SimplerFit | None = None
+) -> tuple[tuple[str, ...], Chain, Fitted]:
     """Return the structurally identifiable names, the chain with start frames, and the fit."""
     model, separations = problem.model, System((), None, (*problem.separations,)).separation_rows
     structural, held = identifiability.identifiable_and_held(
@@ -81,7 +83,7 @@ def _fit_all(
     names: tuple[str, ...],
     start: Chain,
     factor: FloatArray,
-    simpler: Simpler | None,
+    simpler: SimplerFit | None,
 ) -> Fitted:
     """Fit the named parameters from start frames, with priors where needed.
 
@@ -94,16 +96,16 @@ def _fit_all(
     few = problem.system([each.spread(SOME) for each in problem.sets])
     if few.count < sum(map(len, problem.sets)) // 2:
         rough = minimise(rough, names, few, tolerance=1e-2).chain
-    fitted = _fit(*_some(problem, simpler), rough, names)
+    fitted = _fit(*_thin_problem(problem, simpler), rough, names)
     guarded = _guarded(problem, names, fitted.factor, simpler)
     if guarded is not problem:  # outliers carried the information
         problem = guarded
-        fitted = _fit(*_some(problem, simpler), rough, names)
+        fitted = _fit(*_thin_problem(problem, simpler), rough, names)
     size, first = _noise_for_priors(fitted.noise, simpler), fitted.size
     if simpler is None and (fitted.noise.consistent or size <= 1.0):
         size = min(size, _likely_noise(fitted))
     posterior = posterior_of(fitted, size, judging=False)
-    told = (posterior.held(n) <= 1.0 - CONFIDENT for n in names if n not in problem.given)
+    told = (posterior.prior_share(n) <= 1.0 - CONFIDENT for n in names if n not in problem.given)
     if problem.learned is None and not problem.model.effects and all(told):
         return fitted  # the priors found would not change the fit
     for _ in range(ROUNDS):
@@ -122,7 +124,9 @@ def _fit_all(
     return replace(fitted, size=first if simpler is None else min(first, less))
 
 
-def _some(problem: Problem, simpler: Simpler | None) -> tuple[Problem, Simpler | None]:
+def _thin_problem(
+    problem: Problem, simpler: SimplerFit | None
+) -> tuple[Problem, SimplerFit | None]:
     """Thin a problem to the samples that determine the priors of a richer model."""
     share = -(-sum(map(len, problem.sets)) // (2 * SOME))
     if simpler is None or share < 2:
@@ -134,7 +138,7 @@ def _some(problem: Problem, simpler: Simpler | None) -> tuple[Problem, Simpler |
 
 def _fit(
     problem: Problem,
-    simpler: Simpler | None,
+    simpler: SimplerFit | None,
     chain: Chain,
     names: tuple[str, ...],
     again: bool = False,
@@ -153,7 +157,7 @@ def _fit(
     return Fitted(problem, names, robust, factor, noise, uncertainty, noise.size)
 
 
-def _noise_for_priors(noise: Noise, simpler: Simpler | None) -> float:
+def _noise_for_priors(noise: Noise, simpler: SimplerFit | None) -> float:
     """Return the size of the noise [sigma given] that priors are weighed against.
 
     What the geometric model lacks is no noise to it: it can follow a part of it. On measured
@@ -201,7 +205,7 @@ def _likely_noise(fitted: Fitted) -> float:
 
 
 def _guarded(
-    problem: Problem, names: Sequence[str], factor: FloatArray, simpler: Simpler | None
+    problem: Problem, names: Sequence[str], factor: FloatArray, simpler: SimplerFit | None
 ) -> Problem:
     """Return the problem with priors that keep a first fit from diverging.
 

@@ -192,7 +192,7 @@ def identifiable_and_held(
     return found, tuple(held)
 
 
-def followed(
+def best_imitation(
     chain: Chain,
     names: Sequence[str],
     others: Sequence[str],

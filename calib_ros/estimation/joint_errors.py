@@ -44,7 +44,7 @@ class Unmodelled(NamedTuple):
         """Return the covariance (P, P) of the parameters by waves."""
         return np.asarray(self.waves**2 * self.followed @ self.followed.T)
 
-    def among(self, names: Sequence[str]) -> Unmodelled:
+    def for_names(self, names: Sequence[str]) -> Unmodelled:
         """Return the same of other parameters, of which only its own follow."""
         rows = dict(zip(self.names, self.followed, strict=True))
         none = np.zeros(self.followed.shape[1])
@@ -54,10 +54,13 @@ class Unmodelled(NamedTuple):
     def columns(
         self, chain: Chain, names: Sequence[str], joints: FloatArray, rows: FloatArray
     ) -> FloatArray:
-        """Return the columns (K, c, N) at joint values (N, n), waves last; rows as in `moved`."""
-        turns, tilts = moved(chain, names, rows)
+        """Return the columns (K, c, N) at joint values (N, n), waves last.
+
+        Rows as in `turns_and_tilts`.
+        """
+        turns, tilts = turns_and_tilts(chain, names, rows)
         own = rows[[names.index(name) for name in self.names]]
-        left = waved(tilts, joints) - np.tensordot(self.followed, own, (0, 0))
+        left = wobble_columns(tilts, joints) - np.tensordot(self.followed, own, (0, 0))
         return np.concatenate([self.turns * turns, self.tilts * tilts, self.waves * left])
 
     def expected(self, model: ErrorModel, square: FloatArray, joints: FloatArray) -> FloatArray:
@@ -66,7 +69,7 @@ class Unmodelled(NamedTuple):
         In world axes, with expected squares (P, P) of the model's parameters.
         """
         chain, count, some = model.chain, len(model.names), any(self.sizes.values())
-        every = tuple(dict.fromkeys((*model.names, *(moving(chain) if some else ()))))
+        every = tuple(dict.fromkeys((*model.names, *(axis_parameters(chain) if some else ()))))
         joints = chain.joint_values(joints)
         model, squares = ErrorModel(chain, every, *model.ends), np.empty((len(joints), 6, 6))
         for first in range(0, len(joints), BLOCK):
@@ -84,7 +87,7 @@ class Unmodelled(NamedTuple):
 NOTHING = Unmodelled()
 
 
-def moving(chain: Chain) -> list[Parameter]:
+def axis_parameters(chain: Chain) -> list[Parameter]:
     """Return the parameters that turn joints about their axes, and those that tilt the axes.
 
     The latter are those of rows, and turns of bases.
@@ -95,10 +98,12 @@ def moving(chain: Chain) -> list[Parameter]:
     return [*turns, *tilts, *(joint.driven for joint in chain.joints)]
 
 
-def moved(chain: Chain, names: Sequence[str], rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+def turns_and_tilts(
+    chain: Chain, names: Sequence[str], rows: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return the columns of turns (n, c, N) about the axes, and of two tilts (2 n, c, N) of each.
 
-    `rows` (P, c, N) are those of the names, with all that are `moving`. In the standard convention
+    `rows` (P, c, N) are those of the names, with all `axis_parameters`. In the standard convention
     the row before a joint tilts its axis, or the base does.
     """
     own = dict(zip(names, rows, strict=False))
@@ -111,7 +116,7 @@ def moved(chain: Chain, names: Sequence[str], rows: FloatArray) -> tuple[FloatAr
     return np.array([own[joint.driven] for joint in chain.joints]), np.array(tilts)
 
 
-def waved(tilts: FloatArray, joints: FloatArray) -> FloatArray:
+def wobble_columns(tilts: FloatArray, joints: FloatArray) -> FloatArray:
     """Return the columns (8 n, c, N) of wobbling axes at joint values (N, n).
 
     Each tilt (2 n, c, N) follows sine and cosine of the first and second harmonic of its joint.

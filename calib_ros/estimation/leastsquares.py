@@ -128,7 +128,7 @@ def stacked(rows: Sequence[FloatArray]) -> FloatArray:
     return np.concatenate([each.reshape(len(each), -1) for each in rows], axis=1).T
 
 
-def owners(rows: Sequence[FloatArray]) -> Index:
+def row_samples(rows: Sequence[FloatArray]) -> Index:
     """Return the sample number (R,), over all sets, of each row of `stacked`."""
     ends = np.cumsum([each.shape[2] for each in rows]).tolist()
     numbers = [np.arange(end - each.shape[2], end) for end, each in zip(ends, rows, strict=True)]
@@ -232,14 +232,14 @@ def triangular_factor(chain: Chain, names: Sequence[str], system: System) -> Flo
 class Fit(Shown):
     """The chain at the minimum, and the normal equations, linearised before the last step.
 
-    `left` is the RMS step of the predictions (as `STEP_TOLERANCE`) to expect next: at most the
-    last one, or ten times as much as if it were as much shorter again.
+    `next_step_rms` is the RMS step of the predictions (as `STEP_TOLERANCE`) to expect next: at
+    most the last one, or ten times as much as if it were as much shorter again.
     """
 
     chain: Chain
     normal: Normal
     converged: bool
-    left: float = 0.0
+    next_step_rms: float = 0.0
 
 
 def minimise(
@@ -314,7 +314,7 @@ def _next(
     return step, left, settled
 
 
-def without_each(
+def leave_fold_out(
     chain: Chain, names: Sequence[str], system: System, folds: Folds
 ) -> Iterator[Chain]:
     """Yield, for each fold in turn, the chain fitted to all other samples.

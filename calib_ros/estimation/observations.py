@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib_ros.annotated import as_annotated, check_fields
 from calib_ros.errors import InputError
-from calib_ros.estimation.configurations import configurations, stops, successive
+from calib_ros.estimation.configurations import configurations, renumber, stops
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.shown import Shown
@@ -180,7 +180,7 @@ class Observations(Shown):
             few = np.broadcast_to(array[:1], (count, *array.shape[1:])) if alike else array[mask]
             vars(chosen)[name] = few
         if 'configurations' in vars(self):  # slow to compute
-            vars(chosen)['configurations'] = successive(self.configurations[mask])
+            vars(chosen)['configurations'] = renumber(self.configurations[mask])
         return chosen
 
     def spread(self, most: int = SOME_POSES, good: Flags | None = None) -> Observations:

@@ -31,7 +31,7 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
     Raises InputError if no image shows enough points, or half of those that do fit no pose of the
     board.
     """
-    usable = _determine_a_pose(observations)
+    usable = _solvable_images(observations)
     if not usable.any():
         raise InputError(
             'no image shows 4 board points that are not in line: the camera cannot be located'
@@ -121,7 +121,7 @@ def resect(observations: Observations, lens: Lens) -> tuple[FloatArray, FloatArr
     return poses @ se3.invert(board), np.minimum(rms, others)
 
 
-def _determine_a_pose(observations: Observations) -> Flags:
+def _solvable_images(observations: Observations) -> Flags:
     """Return which images (M,) show enough points, not in line on board or image."""
     assert observations.points is not None
     assert observations.pixels is not None

@@ -69,14 +69,14 @@ class Robust:
     loss: str
 
     @property
-    def good(self) -> tuple[Flags, ...]:
+    def inliers(self) -> tuple[Flags, ...]:
         """Return which samples (N,) of each set are no gross errors."""
         return tuple((each <= OUTLIER) | (self.loss == 'none') for each in self.distances)
 
     @property
     def outliers(self) -> Flags:
         """Return which samples (N,) of all sets are gross errors."""
-        return ~np.concatenate(self.good)
+        return ~np.concatenate(self.inliers)
 
 
 def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
@@ -94,7 +94,7 @@ def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) 
     second = reweighted(trimmed_start(chain, names, system), names, system, loss)
     sums = [trimmed_sum(robust.fit.chain, system) for robust in (first, second)]
     another = sums[0] > ALIKE**2 * sums[1]
-    spare = system.rows - unknown(names, system)
+    spare = system.rows - count_free(names, system)
     if another and chance_of_outliers(second, first.fit.chain, names, system, spare) < 1.0 - SURE:
         first = second
     return _with_explained(first, names, system)
@@ -113,7 +113,7 @@ def _with_explained(found: Robust, names: Sequence[str], system: System) -> Robu
     plain = minimise(found.fit.chain, names, system)
     bounded = reweighted(plain.chain, names, system, 'huber')
     before, after = (_squares(robust.fit.chain, system) for robust in (found, bounded))
-    share = max(1.0 - unknown(names, system) / system.rows, ROUNDING)
+    share = max(1.0 - count_free(names, system) / system.rows, ROUNDING)
     price = np.sqrt(after[~out].sum() / max(before[~out].sum(), ROUNDING)) / share
     left = price * np.sqrt(after / np.maximum(before, ROUNDING))
     if price > 1.0 / NEARER or np.median(left[out]) > NEARER:
@@ -219,7 +219,7 @@ def reweighted(
         distances = judged(chain)
         if not fit.converged:
             break
-    if not (settled and fit.left < STEP_TOLERANCE):
+    if not (settled and fit.next_step_rms < STEP_TOLERANCE):
         fit = minimise(chain, names, system)
     return Robust(fit, system, tuple(np.split(distances, ends)), settled, loss)
 
@@ -302,7 +302,7 @@ def _squares(chain: Chain, system: System) -> FloatArray:
     return np.concatenate(found)
 
 
-def unknown(names: Sequence[str], system: System) -> int:
+def count_free(names: Sequence[str], system: System) -> int:
     """Return the number of parameters without a prior."""
     known = {} if system.prior is None else system.prior.sigmas
     return sum(name not in known for name in names)
@@ -320,7 +320,7 @@ def _need(names: Sequence[str], system: System) -> float:
         samples.rows / samples.count * (samples.observations.configurations.max() + 1)
         for samples in system.sets
     )
-    return float(unknown(names, system) / rows)
+    return float(count_free(names, system) / rows)
 
 
 class _Halves:

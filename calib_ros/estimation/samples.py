@@ -155,7 +155,7 @@ class Samples:
             out = found[0], found[1]
             shift = found[0]
             if self.distances is not None:
-                shift = _along(origin, shift, self.distances[part], self.observations.plane)
+                shift = _range_rows(origin, shift, self.distances[part], self.observations.plane)
             else:
                 np.subtract(self.positions[:, part], origin, out=shift[-1])
             if points is not None:
@@ -334,7 +334,7 @@ def seen_residuals(chain: Chain, observations: Observations) -> Both:
     return pixels, np.clip(shifts, -LARGEST, LARGEST)
 
 
-def _along(
+def _range_rows(
     origin: FloatArray, shift: FloatArray, distances: FloatArray, plane: bool
 ) -> FloatArray:
     """Return rows (P + 1, 1, B) along the line of sight or a plane's normal z, and L - |p|."""

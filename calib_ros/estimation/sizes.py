@@ -112,12 +112,12 @@ class Evidence:
             if name in considered:
                 tried = np.tile(size, (3, 1))
                 tried[1:, k] = self._typical[k] + np.log(LEAST_SIZE), self._typical[k]
-                here, without, usual = self._of(tried).tolist()
+                here, without, usual = self._log_evidence(tried).tolist()
                 if not here - without > SHOWN and without - usual > REFUTED:
                     size = tried[1]
         return size, 2.0 * np.maximum(gamma, 0.0) + width
 
-    def against(
+    def odds_against(
         self, usual: Evidence, size: FloatArray, considered: set[str | None]
     ) -> tuple[float, FloatArray, FloatArray]:
         """Return the log odds against the usual evidence at log sizes (G,); mean (P,), covariance.
@@ -146,7 +146,7 @@ class Evidence:
         usual += 0.5 * (((size - self._typical) / np.log(SPREAD)) ** 2).sum()
         return float(fit - usual + np.log(np.abs(np.diag(root))).sum())
 
-    def near(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
+    def sigma_points(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
         """Return plausible log sizes with their weights, from the curvature (G,).
 
         One group differs at a time, up and down, by as much as makes means right to second order
@@ -160,7 +160,7 @@ class Evidence:
         steps = (np.sqrt(len(some) / slope) * np.eye(len(size)))[some]
         tried = self._within(size + np.stack([steps, -steps], axis=1).reshape(-1, len(size)))
         unusual = (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(axis=1)
-        likely = self._of(tried) - 0.5 * unusual
+        likely = self._log_evidence(tried) - 0.5 * unusual
         upper = special.expit(likely[::2] - likely[1::2])
         weights = np.stack([upper, 1.0 - upper], axis=1).ravel() / len(some)
         return list(zip(weights.tolist(), tried, strict=True))
@@ -206,7 +206,7 @@ class Evidence:
         """Return the inverse variances (..., G, P) of the parameters of each group."""
         return np.asarray(self._member * self._tails * np.exp(-2.0 * size)[..., np.newaxis])
 
-    def _of(self, sizes: FloatArray) -> FloatArray:
+    def _log_evidence(self, sizes: FloatArray) -> FloatArray:
         """Return the log evidence of log sizes (S, G)."""
         factors = [_factor(self._matrix, each) for each in self.precision(sizes)]
         seen = [lapack.dtrtrs(each, self._vector, lower=1)[0] for each in factors]

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import InputError
-from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.identifiability import (
     DEGENERATE,
     excited,
@@ -50,7 +50,7 @@ def start_frames(problem: Problem) -> Chain:
     chain, sigmas = problem.model, (problem.sigma_position, problem.sigma_orientation)
     found: set[str] = set()
     counts = [
-        distinct(each.configurations) * kind.rows
+        count_distinct(each.configurations) * kind.rows
         for each, kind in zip(problem.sets, problem.kinds, strict=True)
     ]
     pairs = zip(problem.sets, counts, strict=True)
@@ -109,7 +109,7 @@ def _check_shown(
     Frames that fit all poses exactly tell nothing of the arm.
     """
     groups = numbered(problem.all_sets)
-    folds = min(TELLING, distinct(np.concatenate(groups)))
+    folds = min(TELLING, count_distinct(np.concatenate(groups)))
     rests = [system.select([g % folds != k for g in groups]) for k in range(folds)]
     shown = set(excited(triangular_factor(chain, names, system), names)).intersection(
         *(independent(triangular_factor(chain, names, rest), names) for rest in rests)
@@ -316,7 +316,7 @@ def _complete(
     if observations.seen:
         if not tool.fixed:
             left = wanted - base_matrix[:3, 3] * base.fixed
-            tool_matrix[:3, :3] = _towards(turned, observations, left, not base.fixed)
+            tool_matrix[:3, :3] = _camera_rotation(turned, observations, left, not base.fixed)
         wanted -= np.einsum('nij,nj->ni', turned @ tool_matrix[:3, :3], observations.given)
     wanted -= turned @ tool_matrix[:3, 3]
     if not tool.fixed:
@@ -328,7 +328,7 @@ def _complete(
     return _placed(chain, base_matrix, tool_matrix)
 
 
-def _towards(
+def _camera_rotation(
     turned: FloatArray, observations: Observations, wanted: FloatArray, free: bool
 ) -> FloatArray:
     """Return the rotation (3, 3) of a camera that sees one point, at flange rotations (N, 3, 3).

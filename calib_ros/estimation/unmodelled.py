@@ -33,7 +33,12 @@ from scipy import special
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.identifiability import covariance
-from calib_ros.estimation.joint_errors import Unmodelled, moved, moving, waved
+from calib_ros.estimation.joint_errors import (
+    Unmodelled,
+    axis_parameters,
+    turns_and_tilts,
+    wobble_columns,
+)
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SEVERAL
 from calib_ros.estimation.observations import SOME_POSES
@@ -55,13 +60,13 @@ def unmodelled_errors(
     """
     chain, names = posterior.chain, posterior.names
     count, own = len(names), len(factor)
-    every = tuple(dict.fromkeys((*names, *moving(chain))))
+    every = tuple(dict.fromkeys((*names, *axis_parameters(chain))))
     units, share = gathered(chain, every, system, SOME_POSES)
     used = [part for part in units.parts if part.any()]
     rows = np.concatenate([np.zeros((len(every) + 1, 0, len(units))), *used], axis=1)
     part_of = np.arange(len(used)).repeat([part.shape[1] for part in used])
-    random = moved(chain, every, rows)
-    rows = np.concatenate([rows[:count], waved(random[1], units.joints), rows[-1:]])
+    random = turns_and_tilts(chain, every, rows)
+    rows = np.concatenate([rows[:count], wobble_columns(random[1], units.joints), rows[-1:]])
     products = np.array([gram(rows[:, part_of == k]) for k in range(len(used))])
     groups = configurations(units.joints)
     turns, tilts, waves, shown = _sizes(posterior, rows, (part_of, groups), products, random)

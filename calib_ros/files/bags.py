@@ -84,7 +84,9 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
     with closing(reader):
         available = stored.topic_types((c.topic, c.msgtype) for c in reader.connections)
         defined = {c.msgtype: c.msgdef for c in reader.connections if c.msgdef.data}
-        streams, deserialise = _chosen(session, available, partial(stored.read, reader), defined)
+        streams, deserialise = _choose_streams(
+            session, available, partial(stored.read, reader), defined
+        )
         counts = [c.msgcount for c in reader.connections if c.topic in streams]
         expected = sum(count for count in counts if isinstance(count, int) and count > 0)
         messages = stored.read(reader, streams)
@@ -117,7 +119,7 @@ def _opened(path: Path, folder: Path) -> Any:
 def _salvaged(
     path: Path, found: stored.Salvage, session: CalibrationSession, known: Definitions
 ) -> Replayed:
-    streams, deserialise = _chosen(session, found.topics, found.on, known)
+    streams, deserialise = _choose_streams(session, found.topics, found.on, known)
     count, problem = _feed(session, found.on(streams), deserialise)
     _check_links(streams)
     problem = problem or found.problem
@@ -158,7 +160,7 @@ def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
             yield head_of(message)[0], message
 
 
-def _chosen(
+def _choose_streams(
     session: CalibrationSession,
     available: Mapping[str, str],
     messages_on: MessagesOn,

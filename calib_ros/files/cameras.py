@@ -41,7 +41,7 @@ ENCODINGS |= {'bayer_gbrg8': (1, 'BayerGR'), 'bayer_grbg8': (1, 'BayerGB')}
 """Channels, and what OpenCV calls them: a Bayer pattern by its second row."""
 
 
-class _Told(NamedTuple):
+class _CameraInfo(NamedTuple):
     """What a CameraInfo said: the lens, and height and width [px]."""
 
     stamp_ns: int
@@ -59,7 +59,7 @@ class BoardCamera:
         self._source = source
         self._board = read_board(given_path(source.board))
         self._detector = Detector(self._board)
-        self._told: tuple[_Told, ...] = ()  # whenever it changed, by stamp
+        self._told: tuple[_CameraInfo, ...] = ()  # whenever it changed, by stamp
 
     def learn(self, info: Any) -> None:
         """Take a CameraInfo; an unusable one refuses the images after it."""
@@ -69,7 +69,7 @@ class BoardCamera:
             lens = replace(lens_in(info, not fixed), fixed=fixed)
         except CalibrationError as err:
             lens = Flaw('whose CameraInfo cannot be used', str(err))
-        new = _Told(head_of(info)[0], lens, (info.height, info.width))
+        new = _CameraInfo(head_of(info)[0], lens, (info.height, info.width))
         k = bisect.bisect_right(self._told, new.stamp_ns, key=_stamp)
         if not k or self._told[k - 1][1:] != new[1:]:
             self._told = (*self._told[:k], new, *self._told[k:])[-MOST_ENTRIES:]

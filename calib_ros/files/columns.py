@@ -185,7 +185,9 @@ class Columns:
         return replace(self, lines=self.lines[rows], cells=cells)
 
 
-def of_rows(path: Path, blocks: Iterable[Sequence[Cells]], header: Sequence[str] = ()) -> Columns:
+def from_rows(
+    path: Path, blocks: Iterable[Sequence[Cells]], header: Sequence[str] = ()
+) -> Columns:
     """Return columns of blocks of rows that may end early; further ones are `#1`, `#2` ..."""
     lines: list[int] = []
     parts: list[list[str]] = []  # the columns of each block
@@ -213,10 +215,10 @@ def joined_columns(parts: Sequence[Columns]) -> Columns:
 
 def read_columns(path: Path, needed: Sequence[str]) -> Columns:
     """Return the columns of a CSV that has rows and the needed columns."""
-    return with_rows(columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)), needed)
+    return require_rows(columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)), needed)
 
 
-def with_rows(found: Columns, needed: Sequence[str], how: str = '') -> Columns:
+def require_rows(found: Columns, needed: Sequence[str], how: str = '') -> Columns:
     """Return columns; refuse those without rows or needed columns."""
     missing = [name for name in needed if name not in found.cells]
     if missing:
@@ -244,10 +246,12 @@ def columns_of(
     if twice:
         raise ColumnsError(f'{path} has several columns {", ".join(twice)}: rename all but one')
     end = above + data.count(b'\n') + 1
-    return of_rows(path, _below(path, header, chain([first[1:]], blocks), end, progress), header)
+    return from_rows(
+        path, _rows_below(path, header, chain([first[1:]], blocks), end, progress), header
+    )
 
 
-def _below(
+def _rows_below(
     path: Path, header: Sequence[str], blocks: Iterable[list[Cells]], end: int, progress: Notify
 ) -> Iterator[list[Cells]]:
     """Yield the rows below a header, up to a last line; refuse more values than names."""

@@ -38,7 +38,7 @@ from calib_ros.values import ROUNDED
 THEIRS = (*TURNS, *IN_TURN, *MATRIX, *SIGMAS, 'time')
 
 
-def finished(made: Columns, layout: Layout) -> Columns:
+def to_our_columns(made: Columns, layout: Layout) -> Columns:
     """Return the columns with quaternions for rotations, covariances for standard deviations."""
     cells = {name: given for name, given in made.cells.items() if name not in THEIRS}
     if 'time' in made.cells:

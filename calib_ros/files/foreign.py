@@ -20,12 +20,19 @@ import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.columns import Columns, cell_number
-from calib_ros.files.conventions import finished
-from calib_ros.files.headers import listed, name_and_unit, named_by_option, not_read, only, places
+from calib_ros.files.conventions import to_our_columns
+from calib_ros.files.headers import (
+    listed,
+    name_and_unit,
+    named_by_option,
+    not_read,
+    only_index,
+    places,
+)
 from calib_ros.files.layouts import Expression, Layout
 from calib_ros.files.names import in_doubt, like_joints, named_in, option, quaternions_in, turns_in
 from calib_ros.files.sheets import read_sheet
-from calib_ros.files.skipped import measured, without_statistics
+from calib_ros.files.skipped import drop_unmeasured, without_statistics
 from calib_ros.files.units import Units
 from calib_ros.files.vocabulary import (
     IN_TURN,
@@ -86,8 +93,8 @@ class Foreign:
                 notes += turns_in(path, table.names)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
-        made, skipped = measured(made)
-        return finished(made, self.layout), (*notes, *skipped)
+        made, skipped = drop_unmeasured(made)
+        return to_our_columns(made, self.layout), (*notes, *skipped)
 
     def _logged(
         self, log: _Table, table: _Table, made: Columns
@@ -168,7 +175,7 @@ class _Table:
         named = self._named({n: ours for n, ours in own.items() if ours not in (*asked, *taken)})
         self._columns |= named
         if joints and chain is not None:
-            self._complete(chain)
+            self._refuse_partial(chain)
         self._refuse_nominal(named)
         self._used = {name for each in self._columns.values() for name in each.names}
 
@@ -201,7 +208,7 @@ class _Table:
                 continue
             if len(found) > 1 and ours not in (*WORDS, *QUATERNION):
                 continue
-            column = only(found, name)
+            column = only_index(found, name)
             bare, unit = name_and_unit(self._sheet.header[column])
             rate = JOINT.fullmatch(ours) and ours[0] in 'sva'
             other = rate or ours in (*WORDS, *SIGMAS, 'time', 'delay')
@@ -232,7 +239,7 @@ class _Table:
         if doubt := in_doubt(header, [name_and_unit(name)[0] for name in called], joints):
             raise InputError(f'{self.path}: {doubt}')
 
-    def _complete(self, chain: Chain) -> None:
+    def _refuse_partial(self, chain: Chain) -> None:
         """Refuse a table with the values of some joints; those of coupled ones do not count."""
         names = joint_columns(len(chain.joints))
         given = [name for name in names if name in self._columns]

@@ -64,7 +64,7 @@ def places(header: Sequence[str], name: str) -> list[int]:
     return usual or [k for k, _, bare, _ in parts if name == bare]
 
 
-def only(found: Sequence[int], name: str) -> int:
+def only_index(found: Sequence[int], name: str) -> int:
     """Return the index of a column; refuse several."""
     if len(found) > 1:
         where = ', '.join(some([f'#{k + 1}' for k in found]))

@@ -70,7 +70,7 @@ class Loaded:
         return replace(result, refusals=(*own, *self.refusals))
 
 
-def of_bag(session: CalibrationSession, read: Replayed, largest_loss: float = 1.0) -> Loaded:
+def load_bag(session: CalibrationSession, read: Replayed, largest_loss: float = 1.0) -> Loaded:
     """Return the problem of a bag, of which only a share may be lost."""
     problem, account = session.problem(), session.account()
     samples = {'recorded': read.recorded, 'read': read.read, **asdict(account)}
@@ -108,7 +108,7 @@ def table(
     return read_table(*given, foreign, progress)
 
 
-def of_table(found: Dataset, chain: Chain, settings: Settings, **given: float) -> Loaded:
+def load_table(found: Dataset, chain: Chain, settings: Settings, **given: float) -> Loaded:
     """Return the problem of a table, with `given` arguments."""
     problem = found.problem(chain, settings, **given)
     fitted, held_out = (sum(map(len, sets)) for sets in (found.fitted, found.held_out))

@@ -21,7 +21,7 @@ import numpy as np
 
 from calib_ros.apply.program import Program, joint_values
 from calib_ros.errors import InputError
-from calib_ros.files.columns import Columns, check_quaternions, columns_of, with_rows
+from calib_ros.files.columns import Columns, check_quaternions, columns_of, require_rows
 from calib_ros.files.headers import name_and_unit, places
 from calib_ros.files.sheets import decimal_sign, refuse_short, text_and_separator
 from calib_ros.files.vocabulary import ANGLES, LENGTHS, POSE_COLUMNS, joint_columns
@@ -60,7 +60,7 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
 def _columns(path: Path) -> tuple[Columns, str, str]:
     """Return the columns of a table, the sign between its cells, and its text."""
     text, separator = text_and_separator(path)
-    found = with_rows(columns_of(path, text.encode(), separator=separator), ())
+    found = require_rows(columns_of(path, text.encode(), separator=separator), ())
     if separator == ' ':
         refuse_short(found, found.header[-1])
     return found, separator, text
@@ -85,7 +85,7 @@ def _program(found: Columns, chain: Chain) -> tuple[Columns, tuple[str, ...], Fl
     units = _units(found, dict(zip(columns, kinds, strict=True)))
     how = '; values are in rad or m, or in the unit named there: q1 [deg]'
     how += '; of a Fanuc q3 = J3 + J2' * ('J3' in header)
-    with_rows(found, needed(columns), how)
+    require_rows(found, needed(columns), how)
     if {more, more.upper()} & {*header}:
         raise InputError(
             f'{found.path} has a column {more}, but the arm has {len(joints)} joints only'
@@ -122,7 +122,7 @@ def read_poses(path: Path) -> FloatArray:
     table, *_ = _columns(path)
     columns = [_column(table, name) for name in POSE_COLUMNS]
     how = '; lengths are in m, or in the unit named there: x [mm]'
-    found = with_rows(table, columns, how)
+    found = require_rows(table, columns, how)
     found = replace(found, decimal=decimal_sign(c for n in columns for c in found.texts(n)))
     numbers = found.block(columns)
     numbers[:, :3] *= _units(found, dict.fromkeys(columns[:3], LENGTHS))

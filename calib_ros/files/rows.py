@@ -155,7 +155,7 @@ def samples_hash(sets: Sequence[Observations]) -> str:
     return found.hexdigest()
 
 
-def identified(result: Identification, about: Filing, warnings: Sequence[str] = ()) -> Row:
+def result_row(result: Identification, about: Filing, warnings: Sequence[str] = ()) -> Row:
     """Return the row of an identification; `warnings` are of the measurements."""
     offsets = {str(each.name): each.offset for each in result.parameters}
     names = tuple(map(str, result.names))
@@ -179,14 +179,14 @@ def identified(result: Identification, about: Filing, warnings: Sequence[str] = 
     )
 
 
-def judged(
+def validation_row(
     chain: Chain, before: ErrorFigures | None, after: ErrorFigures, verdict: str, about: Filing
 ) -> Row:
     """Return the row of a validation: a calibration on later poses."""
     return _row(about, 'validate', chain, verdict, (before, after))
 
 
-def verified(chain: Chain, found: Verification, about: Filing) -> Row:
+def verification_row(chain: Chain, found: Verification, about: Filing) -> Row:
     """Return the row of a verification; without freedom, so in no chart, of unfit poses."""
     before, after = found.comparison.figures
     figures = before, replace(after, rms_mm=1e3 * found.rms)

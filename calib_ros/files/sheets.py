@@ -22,10 +22,10 @@ from calib_ros.files.columns import (
     Columns,
     cell_number,
     csv_blocks,
+    from_rows,
     lines_in_words,
-    of_rows,
 )
-from calib_ros.files.headers import name_and_unit, only, places
+from calib_ros.files.headers import name_and_unit, only_index, places
 from calib_ros.files.layouts import Layout
 from calib_ros.files.names import groups
 from calib_ros.files.skipped import refuse_nominal, without_statistics, without_words
@@ -65,7 +65,7 @@ class Sheet:
         found, low = places(self.header, name), [each.lower() for each in self.header]
         for theirs in [each for each, ours in self.known.items() if ours == name]:
             found = found or places(low, theirs.lower())
-        return f'#{only(found, name) + 1}' if found else None
+        return f'#{only_index(found, name) + 1}' if found else None
 
     def called(self, number: str) -> str:
         """Return the name of the column `#k`."""
@@ -178,7 +178,7 @@ def _sheet(
     left: list[Cells] = []
     again = [cells for _, cells in head[at:first]]
     body = without_words(chain([whole[first:]], rows), again, left)
-    columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
+    columns = from_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
     if at >= 0 and max(used, default=0) < len(header):
         _refuse_shifted(columns, len(header))
     if content.blanks:

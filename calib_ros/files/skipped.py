@@ -91,7 +91,7 @@ def refuse_nominal(columns: Columns, remarks: Iterable[Cells]) -> None:
             )
 
 
-def measured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
+def drop_unmeasured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
     """Return the rows in which something was measured, and notes about the others."""
     notes: list[str] = []
     measuring = [name for name in MEASURED_COLUMNS if name in made.cells]

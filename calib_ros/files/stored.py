@@ -263,7 +263,7 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
     with storage.path.open('rb') as file:
         room = mcap.Room(storage.path.stat().st_size)
         problem: Exception | None = None
-        for overlapping in _together(storage.chunks, channels):
+        for overlapping in _chunk_groups(storage.chunks, channels):
             found: list[tuple[int, Stream, bytes]] = []
             for chunk in overlapping:
                 file.seek(chunk.chunk_start_offset)
@@ -281,7 +281,7 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
         raise problem
 
 
-def _together(chunks: Sequence[Any], channels: Mapping[int, Stream]) -> Iterator[list[Any]]:
+def _chunk_groups(chunks: Sequence[Any], channels: Mapping[int, Stream]) -> Iterator[list[Any]]:
     """Yield chunks with messages on some channels, overlapping ones together if they fit."""
     together: list[Any] = []
     end = size = 0

@@ -25,7 +25,7 @@ from calib_ros.files.headers import joints_left_out, name_and_unit, not_read
 from calib_ros.files.journal import columns, of_journal
 from calib_ros.files.measurements import Measurements, distinct_rows, measurements
 from calib_ros.files.names import in_doubt, like_joints, option, quaternions_in, turns_in
-from calib_ros.files.skipped import measured, without_statistics
+from calib_ros.files.skipped import drop_unmeasured, without_statistics
 from calib_ros.files.vocabulary import MATRIX, POSITION, QUATERNION, TURNS, WORDS, joint_columns
 from calib_ros.kinematics.se3 import Index
 from calib_ros.progress import Notify, quiet
@@ -65,7 +65,7 @@ def read_table(
     found, warnings = read or _of_csv(path, joints, progress)
     found, more = _without_others(found)
     warnings = (*warnings, *more)
-    rows, by_line = _chosen(found, joints, sessions), 'stamp_ns' not in found.cells
+    rows, by_line = _select_rows(found, joints, sessions), 'stamp_ns' not in found.cells
     return _dataset(rows, sigmas, eye_in_hand, warnings, by_line)
 
 
@@ -83,7 +83,7 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
     if doubt := in_doubt(found.header, plain, joints * ('q1' in cells)):
         raise ColumnsError(f'{path}: {doubt}')
     found, left = without_statistics(found)
-    kept, skipped = measured(found)
+    kept, skipped = drop_unmeasured(found)
     if skipped and 'q1' in cells:  # of whole rows: others were cut off
         found.block([name for name in joint_columns(joints) if name in cells], needed=False)
         if np.setdiff1d(found.lines[found.blank('q1')], kept.lines).size:
@@ -125,7 +125,7 @@ def _without_others(found: Columns) -> tuple[Columns, tuple[str, ...]]:
     return replace(found, cells=cells), tuple(notes)
 
 
-def _chosen(found: Columns, joints: int, sessions: Sequence[str]) -> Measurements:
+def _select_rows(found: Columns, joints: int, sessions: Sequence[str]) -> Measurements:
     if not len(found.lines):
         measurements(found, joints)  # names missing columns first
         raise InputError(f'{found.path} has no rows')
@@ -195,4 +195,4 @@ def check_table(made: Columns) -> None:
         )
     sessions = made.texts('session') if 'session' in made.cells else ()
     made, _ = _without_others(made)
-    _dataset(_chosen(made, joints, tuple(dict.fromkeys(sessions))))
+    _dataset(_select_rows(made, joints, tuple(dict.fromkeys(sessions))))

@@ -50,11 +50,15 @@ class Units:
         lengths, angles = (*slides, *SIGMAS[:3]), (*turns, *rotations, *SIGMAS[3:])
         usual = self._in_words('angles', ANGLES, layout.angle, angle or own, angles)
         far = self._in_words('lengths', LENGTHS, layout.length, length, (*places, *lengths))
-        found = self._told('length', length, far, places, lengths)
-        turned = self._told('angle', angle, usual, rotations, SIGMAS[3:])
+        found = self._units_of('length', length, far, places, lengths)
+        turned = self._units_of('angle', angle, usual, rotations, SIGMAS[3:])
         main = [name for name in turns if name[0] == 'q']
-        said = set() if any(map(self._said, main)) else {*map(self._said, turned)} - {''}
-        found |= turned | self._told(
+        said = (
+            set()
+            if any(map(self._header_unit, main))
+            else {*map(self._header_unit, turned)} - {''}
+        )
+        found |= turned | self._units_of(
             'joint-angle',
             own or ('' if layout.joint_angle else angle),
             layout.joint_angle or usual or (said.pop() if len(said) == 1 else ''),
@@ -81,7 +85,7 @@ class Units:
             for words in known
             if (ours := [unit for unit in words if unit in units])
         )
-        bare = any(not self._said(name) for name in columns if name in self._columns)
+        bare = any(not self._header_unit(name) for name in columns if name in self._columns)
         if len(told) > 1 and not given and bare:
             raise InputError(
                 f'{self._sheet.path}: {what} are in {" and ".join(told)}, as its lines of units '
@@ -92,7 +96,7 @@ class Units:
             self.notes.append(f'its lines of units say that {what} are in {unit}')
         return unit
 
-    def _told(
+    def _units_of(
         self, option: str, given: str, usual: str, main: Sequence[str], more: Sequence[str]
     ) -> dict[str, str]:
         """Return the units of our columns of a kind: given, in the header, or of the main ones.
@@ -100,7 +104,7 @@ class Units:
         Columns of which the header says nothing have the `usual` unit, if any.
         """
         what, _, assumed = OPTIONS[option]
-        said = {name: self._said(name) for name in (*main, *more) if name in self._columns}
+        said = {name: self._header_unit(name) for name in (*main, *more) if name in self._columns}
         for name, unit in said.items():
             self._check(name, unit, option, given)
         other = given or usual
@@ -143,7 +147,7 @@ class Units:
         if unit and not given and not {*each.terms} <= {*each.names}:
             self.notes.append(f'{ours} = {each.text} is in {unit}, as its header says')
 
-    def _said(self, ours: str) -> str:
+    def _header_unit(self, ours: str) -> str:
         """Return the unit of one of our columns that the header says, `X [mm]`, or empty."""
         each = self._columns[ours]
         found = {name_and_unit(self._sheet.called(name))[1] for name in each.names} - {''}

@@ -17,7 +17,7 @@ from calib_ros.errors import CalibrationError, ConfigError, InputError, shortene
 from calib_ros.files import rows
 from calib_ros.files.bags import replay
 from calib_ros.files.history import is_local
-from calib_ros.files.loading import TABLES, of_bag, of_table, table
+from calib_ros.files.loading import TABLES, load_bag, load_table, table
 from calib_ros.files.unpacked import RECORDED
 from calib_ros.fleet.plant import Robot
 from calib_ros.identification.age import NEVER, measured_at
@@ -128,15 +128,15 @@ def _outcome(task: Task, path: Path) -> Outcome:
     if path.suffix.lower() in TABLES:  # anything else is a bag
         sessions = (source.session,) if source.session else ()
         found = _uncounted(table(path, chain, settings, sessions), task)
-        loaded = of_table(found, chain, settings)
+        loaded = load_table(found, chain, settings)
     else:
         session = CalibrationSession(chain, settings)
-        loaded = of_bag(session, replay(path, session), robot.largest_loss)
+        loaded = load_bag(session, replay(path, session), robot.largest_loss)
     problem, result = loaded.problem, loaded.identified(settings.model)
     warnings = _named(task, path, loaded.warnings)
     time_of = measured_at(problem.all_sets, source.modified)
     known = (content, robot.settings_hash, source.name, source.fingerprint)
-    row = rows.identified(result, rows.Filing(robot.serial, time_of, *known), warnings)
+    row = rows.result_row(result, rows.Filing(robot.serial, time_of, *known), warnings)
     if not task.page:
         return Outcome(row)
     configuration = configuration_yaml(chain.name, settings)

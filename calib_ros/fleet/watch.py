@@ -37,7 +37,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import special
 
 from calib_ros.decision.changes import (
-    Effects,
+    ChangeColumns,
     Explanation,
     Information,
     reason_in_words,
@@ -110,7 +110,7 @@ def watch(rows: Sequence[Row], years: float) -> Watched:
     changes: list[Change] = []
     remarks: list[str] = []
     for names, fitted in alike.items():
-        found = _alike(fitted, years)
+        found = _compare_nights(fitted, years)
         nights += found.nights
         changes += found.changes
         remarks += found.remarks
@@ -130,7 +130,7 @@ def _other(names: frozenset[Parameter], newest: frozenset[Parameter]) -> str:
     return '; '.join(map(' '.join, found))
 
 
-def _alike(fitted: Sequence[_Fitted], years: float) -> Watched:
+def _compare_nights(fitted: Sequence[_Fitted], years: float) -> Watched:
     rows, arms = [row for row, _ in fitted], [arm for _, arm in fitted]
     strengths: list[dict[str, float]] = [{} for _ in rows]
     changes: list[Change] = []
@@ -175,7 +175,7 @@ def _cause(
     one, two = np.split(tests.chances[lag, k], [len(tests.joints)])
     if two.min(initial=1.0) < level * (one.min() if one.min() < level else 1.0):
         return lag, (), tests.groups[len(one) + int(two.argmin())]
-    columns = Effects(row.corrected(), tests.names)
+    columns = ChangeColumns(row.corrected(), tests.names)
     information = Information(tests.names, tests.weight[lag, k], tests.pull[lag, k])
     return lag, reasons_of(information, columns, float(tests.freedom[k]), most=1.0), ()
 
@@ -208,7 +208,7 @@ def _tests(fitted: Sequence[_Fitted], names: tuple[Parameter, ...]) -> _Tests:
     whole, pulled = np.cumsum(information, axis=0), np.cumsum(pulls, axis=0)
     years = np.array([(row.time - fitted[0][0].time) / YEAR for row, _ in fitted])
     drifts = np.diag(drift_of(names))
-    covariances, means = _known(information, pulls, years, drifts)
+    covariances, means = _kalman_filter(information, pulls, years, drifts)
     chances = np.ones((len(LAGS), count, len(groups)))
     several = np.ones((len(LAGS), count))
     pull = np.zeros((len(LAGS), count, size))
@@ -242,7 +242,7 @@ def _tests(fitted: Sequence[_Fitted], names: tuple[Parameter, ...]) -> _Tests:
             left = (whole_of - gain) / others
             beyond = special.fdtrc(others, freedom[nights], left / (CLEARLY**2 * usual))
             several[number, nights] = np.maximum(several[number, nights], beyond)
-            left = _clearly(left, others)
+            left = _above_chance(left, others)
             gain /= np.maximum(usual, left) * len(own)
             known = np.minimum(freedom[nights], others + size * (nights - lag))
             chances[number, nights, j] = special.fdtrc(len(own), known, gain)
@@ -270,7 +270,7 @@ def _information(
     return np.array(information), np.array(pulls)
 
 
-def _known(
+def _kalman_filter(
     information: FloatArray, pulls: FloatArray, years: FloatArray, drifts: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return covariance (K, P, P) and mean (K, P, 1 + T) after each night, by all up to it.
@@ -297,9 +297,9 @@ def _groups(names: Sequence[Parameter]) -> tuple[tuple[str, ...], ...]:
 
 def _usual(scatter: FloatArray, size: int) -> float:
     """Return the scatter of nights relative to their covariances; 1 if these may be right."""
-    return float(_clearly(np.median(scatter), size * scatter.size)) if scatter.size else 1.0
+    return float(_above_chance(np.median(scatter), size * scatter.size)) if scatter.size else 1.0
 
 
-def _clearly(ratio: FloatArray | np.floating[Any], freedom: int) -> FloatArray:
+def _above_chance(ratio: FloatArray | np.floating[Any], freedom: int) -> FloatArray:
     """Return ratios that clearly exceed chance with so many degrees of freedom, else 1."""
     return np.asarray(np.where(ratio > 1.0 + 2.0 * np.sqrt(2.0 / freedom), ratio, 1.0))

@@ -106,7 +106,7 @@ class Calibration(Shown):
         region, noise, owners = result.region, result.noise, owners or {}
         rms_mm = round(after.rms_mm, 6)  # as in the file
         record = {
-            **made(),
+            **provenance(),
             'measured': recorded_time(fitted),
             'accepted': result.accepted,
             'world_frame': result.world_frame,
@@ -314,7 +314,7 @@ class Calibration(Shown):
         )
 
 
-def made() -> dict[str, str]:
+def provenance() -> dict[str, str]:
     """Return the time and software version, for the record."""
     now = datetime.now(timezone.utc).isoformat(timespec='seconds')
     return {'created': now, 'software': f'calib_ros {calib_ros.__version__}'}

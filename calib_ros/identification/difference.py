@@ -24,7 +24,7 @@ import numpy as np
 
 from calib_ros.annotated import as_annotated
 from calib_ros.decision import changes
-from calib_ros.decision.changes import Effects, Explanation, Information
+from calib_ros.decision.changes import ChangeColumns, Explanation, Information
 from calib_ros.decision.drift import inverse_root
 from calib_ros.errors import InputError
 from calib_ros.estimation.evidence import size_group
@@ -67,7 +67,7 @@ class Difference(Shown):
     @property
     def same(self) -> bool:
         """Tell whether no change was detected."""
-        return self.chance > changes.FALSE and not self.changed
+        return self.chance > changes.FALSE_ALARM and not self.changed
 
     def in_words(self) -> str:
         """Return the difference in words."""
@@ -75,12 +75,12 @@ class Difference(Shown):
             return f'unchanged within {1e3 * self.limit:.3f} mm'
         rms, limit = 1e3 * self.rms, 1e3 * self.limit
         size = f'{rms:.3f} mm RMS over the joint range (at most {limit:.3f} mm)'
-        if self.beyond > changes.FALSE:
+        if self.beyond > changes.FALSE_ALARM:
             return (
                 f'different by {size}: not noise, but perhaps smooth device errors or what the '
                 'models lack; to find out, measure the same poses from the same place'
             )
-        if self.changed and self.unexplained > changes.FALSE:
+        if self.changed and self.unexplained > changes.FALSE_ALARM:
             reasons = changes.changes_in_words(self.changed)
             return f'{reasons}; nothing else: was it bumped? Predictions differ by {size}'
         return f'many parameters differ, by {size}: identify again, and inspect the robot'
@@ -129,7 +129,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         raise InputError('neither calibration fitted a parameter of the arm')
     square, lacking = _squares((first, second), names)
     freedom = min(first.freedom, second.freedom)
-    columns = Effects(chain, names)
+    columns = ChangeColumns(chain, names)
     every = left_over = _information(names, change, square)
     chance = _chance(every, freedom)
     beyond = _chance(_information(names, change, lacking), freedom)
@@ -169,7 +169,7 @@ def _squares(
                 f'calibration {number} has no parameter covariance: identify it again with this '
                 'version'
             )
-        waves = each.unmodelled.among(each.names)
+        waves = each.unmodelled.for_names(each.names)
         alone, size = each.covariance - waves.square, max(size, waves.waves)
         apart = _change(each.chain, names, each.names) @ waves.followed - apart
         own = whole = _in_names(each.chain, names, each.names, alone)
@@ -227,7 +227,7 @@ def _change(chain: Chain, names: Sequence[Parameter], own: Sequence[str]) -> Flo
     change = np.array([[float(name == other) for other in parameters] for name in names])
     others = [k for k, name in enumerate(parameters) if name.of_dh and name not in names]
     if others:
-        change[:, others] = changes.gauged(
+        change[:, others] = changes.gauge_map(
             chain, names, [parameters[k] for k in others], free=True
         )[0]
     return change

@@ -21,7 +21,7 @@ from calib_ros.decision import mistakes, plausibility
 from calib_ros.decision.acceptance import oddities, refusals
 from calib_ros.decision.comparison import GroupVerdict, compare
 from calib_ros.decision.drift import chance_of_gain
-from calib_ros.decision.misfits import arms_own, lacking, outliers_of, zero_of_distances
+from calib_ros.decision.misfits import arms_own, coupling_share, outliers_of, zero_of_distances
 from calib_ros.decision.region import Region, region_of
 from calib_ros.decision.result import Identification
 from calib_ros.decision.rounding import may_be_rounding, rounded_joints, rounding_errors
@@ -29,10 +29,10 @@ from calib_ros.decision.steps import find_step
 from calib_ros.decision.validation import validate
 from calib_ros.errors import InputError
 from calib_ros.estimation import identifiability
-from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.considered import considered
-from calib_ros.estimation.evidence import Posterior, posterior_of, with_doubts
-from calib_ros.estimation.fitted import Fitted, ParameterRow, Simpler, parameter_rows
+from calib_ros.estimation.evidence import Posterior, posterior_of, with_mixture
+from calib_ros.estimation.fitted import Fitted, ParameterRow, SimplerFit, parameter_rows
 from calib_ros.estimation.fitting import SOME, fit
 from calib_ros.estimation.leastsquares import System, minimise, normal_equations
 from calib_ros.estimation.levels import SCALE, SEVERAL
@@ -61,7 +61,7 @@ def identify(
     try:
         return _identified(problem, simpler, progress)
     except np.linalg.LinAlgError as err:
-        if found := mistakes.explained(problem):
+        if found := mistakes.diagnose(problem):
             raise InputError(f'the measurements do not fit the arm: {found}') from err
         raise InputError(
             'the fit found no stable solution: check the arm, joint values and units, or measure '
@@ -72,7 +72,7 @@ def identify(
 def _identified(
     problem: Problem, simpler: Identification | None, progress: Notify
 ) -> Identification:
-    known = Simpler(simpler.chain, simpler.distances, simpler.noise) if simpler else None
+    known = SimplerFit(simpler.chain, simpler.distances, simpler.noise) if simpler else None
     structural, start, fitted = fit(problem, known)
     problem, names, robust, chain = fitted.problem, fitted.names, fitted.robust, fitted.chain
     progress(1 / 2)  # with many poses (benchmarks/end_to_end.py)
@@ -85,12 +85,12 @@ def _identified(
     progress(2 / 3)
     validation, validated_by = validate(fitted, before.chain, explained)
     coarse = rounded_joints(problem)
-    share = lacking(fitted)
+    share = coupling_share(fitted)
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
     more = considered(chain, names, problem.fixed)
     posterior = posterior_of(fitted, size, more, doubts)
     unmodelled, moved = unmodelled_errors(posterior, fitted.factor, fitted.system)
-    posterior = with_doubts(replace(posterior, unmodelled=unmodelled), fitted, size, more, doubts)
+    posterior = with_mixture(replace(posterior, unmodelled=unmodelled), fitted, size, more, doubts)
     uncertainty = fitted.uncertainty.with_part(moved).with_part(unmodelled.square)
     parameters = parameter_rows(fitted, structural, uncertainty)
     region, scaled = _region(fitted, posterior, size, more, doubts)
@@ -120,14 +120,14 @@ def _identified(
         step=step,
         remarks=oddities(problem, step, coarse),
         coupled=share > 0.0,
-        images=sum(distinct(s.images) for s in problem.sets if s.pixels is not None),
+        images=sum(count_distinct(s.images) for s in problem.sets if s.pixels is not None),
     )
     own_behaviour = None if step and not step.slow else arms_own(fitted)
     rounding = may_be_rounding(fitted, before.chain, coarse)
     refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None, scaled)
     result = replace(result, refusals=(*result.refusals, *refused))
     named = mistakes.with_mistake(problem, result)
-    return plausibility.remarked(problem, named, another=named is result)
+    return plausibility.add_remarks(problem, named, another=named is result)
 
 
 def _region(
@@ -148,7 +148,7 @@ def _region(
     finer = SCALE if printed else EXCEPTION * SCALE  # as of a tracker
     if region is None and posterior.scale and not 0.0 < problem.sigma_scale <= finer:
         checked = replace(fitted, problem=replace(problem, sigma_scale=finer))
-        if of(with_doubts(posterior, checked, size, more, doubts)) is not None:
+        if of(with_mixture(posterior, checked, size, more, doubts)) is not None:
             return None, posterior.scale
     return region, 0.0
 
@@ -162,8 +162,8 @@ def _size(fitted: Fitted, explained: float) -> float:
     if fitted.noise.consistent:
         return size
     numbers = fitted.problem.configurations
-    seen = sum(distinct(each) for each in numbers)
-    return size * float(np.sqrt(seen / distinct(np.concatenate(numbers))))
+    seen = sum(count_distinct(each) for each in numbers)
+    return size * float(np.sqrt(seen / count_distinct(np.concatenate(numbers))))
 
 
 def _priors(problem: Problem) -> dict[str, float]:
@@ -180,7 +180,7 @@ def _chance(fitted: Fitted, before: Chain) -> float | None:
     problem, names = fitted.problem, fitted.names
     if any(each.socket for each in problem.sets):
         return None
-    pairs = zip(problem.sets, fitted.robust.good, strict=True)
+    pairs = zip(problem.sets, fitted.robust.inliers, strict=True)
     sets = [each.spread(SOME, good) for each, good in pairs]
     frames = [name for name in names if before.owns_frame(name)]
     arm = [name for name in names if not before.owns_frame(name)]
@@ -222,7 +222,7 @@ def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Id
     fit, tried = len(problem.free) * poses, columns * min(poses, COMPARED)
     first, second = np.array([fit, fit + tried]) / (2 * fit + tried)  # entries of all columns
     result = identify(problem, progress=share_of(progress, 0.0, first))
-    chosen, verdicts = _chosen(problem, result, share_of(progress, first, second))
+    chosen, verdicts = _choose_effects(problem, result, share_of(progress, first, second))
     if chosen:
         progress(f'model with {len(chosen)} effects')
         rest = share_of(progress, second, 1.0)
@@ -238,7 +238,7 @@ def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Id
     return replace(result, verdicts=verdicts)
 
 
-def _chosen(
+def _choose_effects(
     problem: Problem, geometric: Identification, progress: Notify
 ) -> tuple[tuple[str, ...], tuple[GroupVerdict, ...]]:
     progress('effects')
@@ -275,7 +275,7 @@ def _choose_groups(
         best = min(paying, key=lambda group: verdicts[group].rms_mm_after)
         left.remove(best)
         chosen += groups[best]
-        model.quieten(verdicts[best])
+        model.shrink_noise(verdicts[best])
     every = [name for group in left for name in groups[group]]
     together = model.judge(chosen, every, 'all')
     if not together.pays:
@@ -289,7 +289,7 @@ def _choose_groups(
             every = others
     if every:
         chosen += every
-        model.quieten(together)
+        model.shrink_noise(together)
 
 
 def _choose_harmonics(
@@ -301,7 +301,7 @@ def _choose_harmonics(
         verdicts[verdict.what] = verdict
         if verdict.pays:
             chosen.extend(name for name in names if name not in chosen)
-            model.quieten(verdict)
+            model.shrink_noise(verdict)
         return verdict.pays
 
     before = len(chosen)

@@ -21,7 +21,7 @@ from calib_ros.decision.drift import ShiftProducts, Shifts, chance
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.evidence import size_group
 from calib_ros.estimation.identifiability import independent
-from calib_ros.estimation.leastsquares import owners, stacked
+from calib_ros.estimation.leastsquares import row_samples, stacked
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SURE
 from calib_ros.estimation.observations import SOME_POSES, numbered
 from calib_ros.estimation.problem import Learned, Problem
@@ -67,7 +67,7 @@ class LinearModel:
             blocks[new] = np.arange(len(new)) * problem.folds // len(new)
         rows = self._rows(self._names)
         self._ends = np.cumsum([each[-1].size for each in rows])
-        owner = owners(rows)
+        owner = row_samples(rows)
         self._folds = np.array([self._groups % problem.folds, blocks[self._groups]])[:, owner]
         *columns, residual = stacked(rows).T
         self._columns = np.zeros((0, len(owner)))
@@ -111,8 +111,8 @@ class LinearModel:
         new = [name for name in added if name not in chosen]
         found, pays = [], True
         for dealing in range(len(self._folds)):
-            before = self._left_out(dealing, chosen)
-            after = self._left_out(dealing, [*chosen, *new])
+            before = self._held_out_errors(dealing, chosen)
+            after = self._held_out_errors(dealing, [*chosen, *new])
             gain, limit = log_gain(before, after, self._groups, SURE)
             pays = pays and gain > max(limit, COUNTS)
             found += [1e3 * float(np.sqrt((e**2).sum(axis=1).mean())) for e in (before, after)]
@@ -120,7 +120,7 @@ class LinearModel:
             pays = chance(self._shares(chosen, [new])[0]) < 1.0 - CERTAIN
         return GroupVerdict(what, found[0], found[1], bool(pays))
 
-    def quieten(self, verdict: GroupVerdict) -> None:
+    def shrink_noise(self, verdict: GroupVerdict) -> None:
         """Take what is left with chosen effects for the noise that priors are weighed against."""
         self._noise *= verdict.rms_mm_after / max(verdict.rms_mm_before, 1e-300)
         prior = self._system.prior
@@ -206,7 +206,7 @@ class LinearModel:
         added = [name for name in names if name not in self._names]
         return self._system.rows_of(self._chain.with_effects(added), names)
 
-    def _left_out(self, dealing: int, chosen: Sequence[str]) -> FloatArray:
+    def _held_out_errors(self, dealing: int, chosen: Sequence[str]) -> FloatArray:
         """Return held-out position errors (N, 3) [m] of every sample, by the other folds."""
         which = [*range(1, 1 + len(self._names)), *self._columns_of(chosen)]
         key = (dealing, *which)

@@ -66,7 +66,7 @@ class Recalibration(Shown):
         """Tell whether the result may be used."""
         most = max(ALIKE * self.before.rms_mm, 1e3 * SAME)  # simulated without noise
         agrees = self.after.rms_mm <= min(most, 1e3 * Settings.largest_error)
-        fits = self.unexplained > changes.FALSE and agrees
+        fits = self.unexplained > changes.FALSE_ALARM and agrees
         return fits and self.determined and not (self.reused or self.outside)
 
     @property
@@ -99,7 +99,7 @@ class Recalibration(Shown):
         So far from the earlier arm the linear model of changes does not hold.
         """
         far = self.before.rms_mm > 1e3 * Settings.largest_error and not self.reused
-        return far and (len(self.changed) > 1 or self.unexplained <= changes.FALSE)
+        return far and (len(self.changed) > 1 or self.unexplained <= changes.FALSE_ALARM)
 
     def with_moved(self, frame: str, earlier: Chain, found: Recalibration) -> Recalibration:
         """Return the result, fitted with a free `frame`, that names this frame as the change.
@@ -143,7 +143,7 @@ class Recalibration(Shown):
         if self.odd:
             why = f'{self.odd} contradicts all others: without it they would be accepted'
             return why, 'measure it again, or leave it out'
-        if (cause := self.outside) and self.unexplained > changes.FALSE:
+        if (cause := self.outside) and self.unexplained > changes.FALSE_ALARM:
             if not self.out_of_scale:
                 why = 'the arm bends as under another load than in the earlier calibration'
                 return why, f'measure with that load, or, with this one, {ANEW}'
@@ -155,7 +155,7 @@ class Recalibration(Shown):
         if self.step:
             why = f'something moved while the new poses were measured: {self.step}'
             return why, 'measure again, or give only the poses from there on'
-        if self.unexplained <= changes.FALSE:
+        if self.unexplained <= changes.FALSE_ALARM:
             step = ANEW
             if self.before.rms_mm > 1e3 * Settings.largest_error:
                 step = (

@@ -24,12 +24,12 @@ import numpy as np
 
 from calib_ros.annotated import NotNegative, as_annotated
 from calib_ros.decision import changes, mistakes
-from calib_ros.decision.changes import SCALE_OF_DEVICE, Effects, Explanation, Information, root_of
+from calib_ros.decision.changes import SCALE_OF_DEVICE, ChangeColumns, Explanation, Information
 from calib_ros.decision.comparison import Comparison, compare, residuals
-from calib_ros.decision.validation import left_out
+from calib_ros.decision.validation import fold_residuals
 from calib_ros.errors import InputError
-from calib_ros.estimation.configurations import distinct
-from calib_ros.estimation.considered import Doubts, doubted_products
+from calib_ros.estimation.configurations import count_distinct
+from calib_ros.estimation.considered import Nuisances, nuisance_products
 from calib_ros.estimation.leastsquares import System, products_of
 from calib_ros.estimation.levels import SCALE, SEVERAL, TRIED, chance_of
 from calib_ros.estimation.observations import SOME_POSES, Observations, numbered
@@ -37,7 +37,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER
 from calib_ros.estimation.start import in_new_frames, released
 from calib_ros.identification.age import drift_of, recorded_time
-from calib_ros.identification.calibration import Calibration, about, made
+from calib_ros.identification.calibration import Calibration, about, provenance
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.records import Fingerprint
 from calib_ros.kinematics import se3
@@ -66,7 +66,7 @@ def recalibrate(
     previous = _released(previous, new)
     ours = [name for name in new if name in problem.chain.frame_names]
     problem = replace(problem, chain=released(problem.chain, ours))
-    if mistake := mistakes.explained(problem, far=True):
+    if mistake := mistakes.diagnose(problem, far=True):
         raise InputError(f'the new poses do not fit the arm: {mistake}')
     try:
         found, arm = _recalibrated(previous, problem, years, growth, new)
@@ -95,8 +95,8 @@ def recalibrate(
             held_out = 'held-out ' if number >= len(problem.sets) else ''
             name = rows_in_words([pose], problem.all_sets[number].stamps_ns)
             return replace(found, odd=f'{held_out}{name}{where}')
-    if found.unexplained <= changes.FALSE:
-        if mistake := mistakes.explained_alone(problem, arm):
+    if found.unexplained <= changes.FALSE_ALARM:
+        if mistake := mistakes.diagnose_alone(problem, arm):
             raise InputError(f'the new poses do not fit the arm: {mistake}')
         return replace(found, step=previous.step(problem.all_sets))
     return found
@@ -141,23 +141,23 @@ def _recalibrated(
     # corrected axes are never quite parallel
     nominal = previous.before.with_effects([name for name, _ in arm.chain.effects])
     own = [n for end in new for n in parameters_of(end)]
-    anywhere = 10.0 * changes.shown(nominal, arm.names, own)  # m, rad
+    anywhere = 10.0 * changes.gauge_columns(nominal, arm.names, own)  # m, rad
     if anywhere.size:
         chain = in_new_frames(problem, arm.chain, new, system)
         arm = replace(arm, chain=chain, square=arm.square + anywhere @ anywhere.T)
     movable = _movable(arm.chain, sets, new)
-    columns = Effects(nominal, arm.names, movable, _may_be_scaled(arm.chain, sets))
+    columns = ChangeColumns(nominal, arm.names, movable, _may_be_scaled(arm.chain, sets))
     named: list[tuple[Parameter, ...]] = []
     then, earlier = arm, arm.changed(np.zeros(len(arm.names)), arm.square)
-    found = arm.solved(system)
+    found = arm.solve_change(system)
     for _ in range(SEVERAL):  # after a large change the model is linear elsewhere
         changed = then.changes(found.information, columns)
         arm = then.widened(columns, changed)
-        found = arm.solved(system)
+        found = arm.solve_change(system)
         told, named = named, [each.names for reasons in changed for each in reasons]
         if told == named:
             break
-    expected, _ = found.information.mean(root_of(arm.doubted))
+    expected, _ = found.information.mean(changes.root_of(arm.doubted))
     left = found.squares - float(found.information.vector @ expected)
     updated = _updated(arm, found, problem, changed)
     result = Recalibration(
@@ -165,7 +165,7 @@ def _recalibrated(
         tuple(changed),
         chance_of(left, system.rows, previous.freedom),
         _judged(arm, anywhere, found, system, sets),
-        *_known(arm, then.square, found),
+        *_rms_positions(arm, then.square, found),
         previous.reused(sets),
         compare(earlier, updated.chain, sets).figures[1].rms_mm,
     )
@@ -178,7 +178,7 @@ def _movable(chain: Chain, sets: Sequence[Observations], new: Sequence[str]) -> 
     return [end for end in ends if end not in new and not chain.frame(end).fixed]
 
 
-def _known(arm: _Arm, before: FloatArray, found: _Found) -> tuple[float, float, float]:
+def _rms_positions(arm: _Arm, before: FloatArray, found: _Found) -> tuple[float, float, float]:
     """Return the RMS position [m] of uncertainty before and after, and of the change.
 
     Over the joint range; `before` (P, P) are expected squares of the parameters' errors.
@@ -243,7 +243,8 @@ class _Arm:
             )
         previous.require_frames(sets)
         chain, names, square = previous.chain, previous.names, previous.covariance
-        square, device = square - previous.unmodelled.among(names).square, np.zeros_like(square)
+        square = square - previous.unmodelled.for_names(names).square
+        device = np.zeros_like(square)
         if (region := previous.region) is not None:
             chain, names = region.chain, region.names
             square, device = region.square, region.device @ region.device.T
@@ -254,18 +255,20 @@ class _Arm:
     @cached_property
     def root(self) -> FloatArray:
         """Return a root (P, P) of the covariance."""
-        return root_of(self.square)
+        return changes.root_of(self.square)
 
     @property
     def doubted(self) -> FloatArray:
         """Return the covariance (P, P) of arm and device."""
         return self.square + self.device
 
-    def widened(self, columns: Effects, changed: Sequence[Sequence[Explanation]]) -> _Arm:
+    def widened(self, columns: ChangeColumns, changed: Sequence[Sequence[Explanation]]) -> _Arm:
         """Return the arm with changes of unknown size."""
         return replace(self, square=self.square + columns.spread(changed))
 
-    def changes(self, information: Information, columns: Effects) -> list[tuple[Explanation, ...]]:
+    def changes(
+        self, information: Information, columns: ChangeColumns
+    ) -> list[tuple[Explanation, ...]]:
         """Return what has changed, each with its likely explanations."""
         found: list[tuple[Explanation, ...]] = []
         while reasons := self.widened(columns, found).reasons(information, columns):
@@ -278,7 +281,7 @@ class _Arm:
         left_over = information.marginalised(self.doubted)
         return changes.likelier(left_over, columns, self.previous.freedom, found)
 
-    def reasons(self, information: Information, columns: Effects) -> tuple[Explanation, ...]:
+    def reasons(self, information: Information, columns: ChangeColumns) -> tuple[Explanation, ...]:
         """Return what has changed; of possible device errors only another scale."""
         freedom = self.previous.freedom
         found = changes.reasons_of(information.marginalised(self.square), columns, freedom)
@@ -307,18 +310,17 @@ class _Arm:
         own: dict[str, float] = {self.names[k]: float(applied[k]) for k in self.own}
         return replace(self.chain, effects=self.previous.chain.effects).with_offsets(own)
 
-    def solved(self, system: System) -> _Found:
+    def solve_change(self, system: System) -> _Found:
         """Return the mean change given the new poses, relinearised until it converges.
 
         The prior is a whole covariance, while `leastsquares` takes single sigmas.
         """
         change = np.zeros(len(self.names))
-        doubts = Doubts(by_device=True, unmodelled=self.previous.unmodelled)
+        nuisances = Nuisances(by_device=True, unmodelled=self.previous.unmodelled)
         for _ in range(4):  # changes of millimetres converge in two
             chain = self.chain.with_offsets(dict(zip(self.names, change, strict=True)))
-            products = doubted_products(
-                chain, self.names, system, doubts, most=system.count
-            ).reduced
+            found = nuisance_products(chain, self.names, system, nuisances, most=system.count)
+            products = found.reduced
             matrix, gradient = products[:-1, :-1], products[:-1, -1]
             information = Information(self.names, matrix, gradient + matrix @ change)
             squares = float(products[-1, -1] + change @ (gradient + information.vector))
@@ -340,7 +342,7 @@ def _judged(
     `frames` (P, K) is a root of the covariance of new frames alone, which the others tell too.
     """
     groups = numbered(sets)
-    count = min(SOME_POSES, distinct(np.concatenate(groups)))
+    count = min(SOME_POSES, count_distinct(np.concatenate(groups)))
     folds = [numbers % count for numbers in groups]
     chain = arm.chain.with_offsets(dict(zip(arm.names, found.change, strict=True)))
     chains = []
@@ -349,7 +351,7 @@ def _judged(
         matrix = products[:-1, :-1]
         rest = Information(arm.names, matrix, products[:-1, -1] + matrix @ found.change)
         chains.append((arm.changed(*rest.mean(frames)), arm.changed(*rest.mean(arm.root))))
-    before, after = left_out(chains, sets, groups, folds)
+    before, after = fold_residuals(chains, sets, groups, folds)
     return Comparison(before, after, np.ones(len(before.position), dtype=bool))
 
 
@@ -368,13 +370,13 @@ def _updated(
     left = found.change - arm.applied(found.change, found.covariance)
     square = found.covariance + np.outer(left, left)
     names = tuple(arm.names[k] for k in own)
-    unmodelled = previous.unmodelled.among(names)
+    unmodelled = previous.unmodelled.for_names(names)
     if region is not None:
         effects = [name for name, _ in region.chain.effects]
         region = replace(region, chain=chain.with_effects(effects), square=square)
     record = {
         **previous.record,
-        **made(),
+        **provenance(),
         **about(chain, before, region),
         'previous': {key: previous.record.get(key) for key in ('created', 'table_sha256')},
         'measured': recorded_time(problem.all_sets),

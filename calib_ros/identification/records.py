@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.decision.region import damaged, parse_rows, unpacked_matrix
+from calib_ros.decision.region import damage_error, parse_rows, unpacked_matrix
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.noise import Noise
@@ -218,7 +218,7 @@ class Record:
             if not (ours and (np.diag(square) > 0.0).all() and freedom > 0.0):
                 raise ValueError('no covariance of this chain')
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
-            raise damaged('covariance', self.where, err) from err
+            raise damage_error('covariance', self.where, err) from err
         return names, square, freedom, lacking
 
     def noise(self) -> Noise | None:
@@ -237,7 +237,7 @@ class Record:
                 given={str(n): parse_number(sigma, f'given: {n}') for n, sigma in given.items()},
             )
         except (ConfigError, KeyError, TypeError) as err:
-            raise damaged('noise_in_sigma', self.where, err) from err
+            raise damage_error('noise_in_sigma', self.where, err) from err
 
     def owners(self) -> dict[str, Owner]:
         """Return the recorded owners of the frames."""
@@ -247,7 +247,7 @@ class Record:
             session, eye, socket, label = (parts.get(key) for key in OWNER)
             named = isinstance(session, str) and isinstance(label, str)
             if not (named and isinstance(eye, bool) and isinstance(socket, bool)):
-                raise damaged(f'frames.{name}', self.where)
+                raise damage_error(f'frames.{name}', self.where)
             found[name] = (str(session), bool(eye), bool(socket), str(label))
         return found
 

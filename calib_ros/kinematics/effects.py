@@ -167,7 +167,7 @@ def basis(
     phi = np.zeros((len(names), q.shape[1]))
     if not names:
         return phi
-    q = led(chain, q)
+    q = couple_held(chain, q)
     circles: dict[int, NDArray[np.complex128]] = {}
     for kind, (rows, joints, others) in _by_kind(tuple(names), chain.joint_names).items():
         if kind == 'ratio':
@@ -202,7 +202,7 @@ def _wave(
     return np.asarray(circles[joint][orders.astype(int) - 1])
 
 
-def led(
+def couple_held(
     chain: _Arm, values: FloatArray, couplings: bool = True, rates: bool = False
 ) -> FloatArray:
     """Return joint values (n, B), or their `rates`, held joints where their couplings lead them.
@@ -230,7 +230,7 @@ def moved_joints(chain: _Arm, names: Sequence[str], phi: FloatArray, q: FloatArr
     """Return joint values (n, B) plus effects with phi (E, B); of held joints their limit."""
     known = dict(chain.effects)
     values = [known[name] for name in names]
-    q = led(chain, q, couplings=False)
+    q = couple_held(chain, q, couplings=False)
     if not any(values):
         return q
     shares = np.zeros((len(q), len(names)))

@@ -108,7 +108,7 @@ class ErrorModel:
         np.take(flat, layout.shifts, axis=0, out=shift[self.rotations : -1], mode='clip')
         shift[layout.still], turn[layout.unturned] = 0.0, 0.0
         if velocity is not None and layout.delay is not None:
-            rates = effects.led(self.chain, velocity, rates=True)
+            rates = effects.couple_held(self.chain, velocity, rates=True)
             turn[layout.delay], shift[layout.delay] = _twist(walk, rates, frames, target[3])
         phi = phi[: len(layout.effects)] * walk.signs[layout.joints]
         return target[:3], target[3], shift, turn, phi

@@ -83,7 +83,7 @@ def chain_from_urdf(
     frame = first = _first_frame(places[0], axes[0])
     rows = [_row(joint) for joint in moving]
     for i in range(len(rows) - 1):
-        rows[i] = _towards(rows[i], frame, axes[i + 1], places[i + 1][:3, 3])
+        rows[i] = _row_to_axis(rows[i], frame, axes[i + 1], places[i + 1][:3, 3])
         frame = frame @ _ends(Chain('row', 'standard', (rows[i],)))[0]
     rows[-1] = replace(rows[-1], d=_clean(float(frame[:3, 2] @ (tip - frame)[:3, 3])))
     if convention == 'modified':  # bends are in the next row
@@ -230,7 +230,7 @@ def with_common_normals(chain: Chain) -> Chain:
         if not row.b and (close or not row.beta):
             continue
         end = _ends(Chain('row', 'standard', (row,)))[0]
-        plain = _towards(row, np.eye(4), end[:3, 2], end[:3, 3], common_normal=not close)
+        plain = _row_to_axis(row, np.eye(4), end[:3, 2], end[:3, 3], common_normal=not close)
         rest = se3.invert(_ends(Chain('row', 'standard', (plain,)))[0]) @ end
         rows[i] = replace(rows[i], theta=plain.theta, d=plain.d)
         rows[k] = replace(rows[k], a=plain.a, alpha=plain.alpha, beta=plain.beta, b=0.0)
@@ -240,7 +240,7 @@ def with_common_normals(chain: Chain) -> Chain:
     return replace(chain, joints=tuple(rows), parallel=None)
 
 
-def _towards(
+def _row_to_axis(
     row: Joint, frame: FloatArray, axis: FloatArray, point: FloatArray, common_normal: bool = False
 ) -> Joint:
     """Return a standard row that leads from a frame on its axis to the next axis.

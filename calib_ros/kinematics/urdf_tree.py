@@ -100,9 +100,9 @@ class Description:
                     'on one side of it'
                 )
         leaders = {each.name: (each.name, 1.0, 0.0) for each in path if not each.follows}
-        return tuple(self._led(joint, leaders) if joint.follows else joint for joint in path)
+        return tuple(self._as_mimic(joint, leaders) if joint.follows else joint for joint in path)
 
-    def _led(
+    def _as_mimic(
         self, joint: DescribedJoint, leaders: dict[str, tuple[str, float, float]]
     ) -> DescribedJoint:
         """Return a joint as it follows one of the `leaders`, or as the leader of its master."""

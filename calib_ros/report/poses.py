@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from calib_ros.decision.comparison import Comparison, axes_of, by_axes
 from calib_ros.decision.result import Identification
-from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.pixels import samples_of
 from calib_ros.estimation.problem import Problem
@@ -198,7 +198,7 @@ def poses_to_verify(
     count = len(comparison.judged)
     samples = [samples_of(each, Settings().sigmas, Settings.sigma_pixel) for each in sets]
     groups = [(samples, comparison, np.full(count, JUDGED), np.full(count, np.nan))]
-    repeats = distinct(comparison.after.configurations) < count
+    repeats = count_distinct(comparison.after.configurations) < count
     return _poses(chain, groups, by_line, NAMELESS, repeats)
 
 

@@ -14,7 +14,7 @@ from calib_ros.apply.workspace import survey
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
-from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
@@ -75,7 +75,7 @@ def identification_report(
             '' if result.validation else UNPROVEN,
             f'"Before" is {words.BEFORE_IS}, so the gain comes from the arm alone.',
             'RMS (root mean square) is the typical error over poses like these.',
-            *(f'Note: {note}.' for note in filter(None, (words.in_part(result),))),
+            *(f'Note: {note}.' for note in filter(None, (words.error_meaning(result),))),
             with_outliers=judged.figures_of_all[1] if judged.outliers else None,
             intervals=result.validation is not None,
         ),
@@ -164,7 +164,7 @@ def advice_of(result: Identification) -> tuple[Advice, ...]:
             return (replace(good, refusal='; '.join(result.refusals)),)
     held_out = () if judged is None or judged.repeated is None else (judged,)
     numbers = (each.after.configurations for each in (result.fitted, *held_out))
-    poses = sum(map(distinct, numbers))
+    poses = sum(map(count_distinct, numbers))
     sigma = None if result.images else result.noise.given.get('sigma_position')
     auto, drifts = bool(result.verdicts), words.drifts(result.noise)
     situation = Situation(poses, noise, sigma, auto, drifts, len(result.outliers))

@@ -40,7 +40,7 @@ def gain(which: Comparison, intervals: bool = True) -> str:
     """Return the errors before and after, with their uncertainty if wanted."""
     parts = []
     for when, found in enumerate(which.figures):
-        between = words.between(which, when) if intervals else ''
+        between = words.rms_range_mm(which, when) if intervals else ''
         parts.append(f'{rounded(found.rms_mm)} mm' + (f' ({between})' if between else ''))
     return f'RMS position error: {" → ".join(parts)}'
 
@@ -56,7 +56,7 @@ def accuracy_section(
 ) -> Section:
     """Return the accuracy table, before and after; `things` are counted."""
     columns = [
-        _column(name, found, words.between(judged, when) if intervals else '')
+        _column(name, found, words.rms_range_mm(judged, when) if intervals else '')
         for when, (name, found) in enumerate(zip(('before', 'after'), judged.figures, strict=True))
     ]
     if with_outliers is not None:

@@ -102,7 +102,7 @@ def standing(found: Verification) -> tuple[Headline, tuple[str, ...]]:
     return state, steps
 
 
-def likely(found: Verification) -> str:
+def likely_rms(found: Verification) -> str:
     """Return the RMS error over poses like these, with its interval."""
     between = interval_mm(1e3 * found.lower, 1e3 * found.upper)
     return f'{rounded(1e3 * found.rms)} mm ({100.0 * found.confidence:g} %: {between} mm)'
@@ -181,7 +181,9 @@ def causes(found: Verification) -> list[str]:
     largest = max(Settings.largest_error, found.limit or 0.0)
     if found.step or found.odd:
         lines += [f'something moved while you measured: {found.step}'] if found.step else []
-        lines.append(_apart(found) if found.odd else 'put right what moved, and measure again')
+        lines.append(
+            _odd_in_words(found) if found.odd else 'put right what moved, and measure again'
+        )
     elif (found.common if found.common < NEARER else 1.0) * rms > largest:
         lines.append(
             'no arm is so far off: check units and columns of the measurements (--length, '
@@ -198,7 +200,7 @@ def causes(found: Verification) -> list[str]:
     return lines
 
 
-def _apart(found: Verification) -> str:
+def _odd_in_words(found: Verification) -> str:
     """Return which poses are beyond the limit while the others are within it."""
     first, last = found.odd[0] + 1, found.odd[-1] + 1
     names = f'poses {", ".join(some([str(k + 1) for k in found.odd]))} alone are up to'
@@ -219,7 +221,7 @@ def verification_report(
 ) -> Report:
     """Return the report of a verification of a calibrated chain."""
     text = [
-        f'The RMS position error over poses like these, each counted once, is {likely(found)}.'
+        f'The RMS position error over poses like these, each counted once, is {likely_rms(found)}.'
     ]
     if found.fitted:
         text.append('The interval allows for the refitted frames.')

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib_ros.apply.confidence import interval_of, rms_limits
 from calib_ros.apply.verification import Verdict
-from calib_ros.decision.changes import FALSE, changes_in_words
+from calib_ros.decision.changes import FALSE_ALARM, changes_in_words
 from calib_ros.decision.comparison import Comparison, ErrorFigures
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.result import Identification
@@ -46,11 +46,11 @@ def summary(
     do first about a refusal.
     """
     figures = (result.validation or result.fitted).figures
-    text = f'{fitted_data(result)}, {change(figures)} ('
-    if likely := between(result.validation, 1):
+    text = f'{fitted_data(result)}, {rms_change(figures)} ('
+    if likely := rms_range_mm(result.validation, 1):
         text += f'95 %: {likely} mm; '
     text += f'by {result.validated_by})'
-    if pixels := change(figures, 'px'):
+    if pixels := rms_change(figures, 'px'):
         text += f', {pixels}'
     if count := len(result.outliers):
         where = ', see the report' if numbers is None else f': {_named(result.outliers, numbers)}'
@@ -69,13 +69,13 @@ def summary(
     return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {todo}{text}'
 
 
-def change(figures: Sequence[ErrorFigures], unit: str = 'mm') -> str:
+def rms_change(figures: Sequence[ErrorFigures], unit: str = 'mm') -> str:
     """Return the RMS errors before and after in mm, mrad or px; empty if not measured."""
     found = [getattr(each, f'rms_{unit}') for each in figures]
     return '' if None in found else f'RMS {" -> ".join(map(rounded, found))} {unit}'
 
 
-def between(judged: Comparison | None, when: int) -> str:
+def rms_range_mm(judged: Comparison | None, when: int) -> str:
     """Return the 95 % interval [mm] of the RMS before (0) or after (1), empty if unknown."""
     limits = limits_mm(judged, when)
     return '' if limits is None else interval_mm(*limits)
@@ -124,7 +124,7 @@ def notes(result: Identification) -> list[str]:
     given = set(result.priors) - set(result.weak) - {name for name, _ in result.chain.effects}
     if given:
         found.append(f'priors on {counted(len(given), "parameter")}')
-    if partly := in_part(result):
+    if partly := error_meaning(result):
         found.append(partly)
     if result.weak:
         found.append(f'hardly determined, held near nominal by priors: {", ".join(result.weak)}')
@@ -134,7 +134,7 @@ def notes(result: Identification) -> list[str]:
     return found
 
 
-def in_part(result: Identification) -> str:
+def error_meaning(result: Identification) -> str:
     """Return what errors of distances, planes and corners mean; empty for positions alone."""
     position = result.fitted.after.position
     if (np.abs(position[:, 0]) > SAME)[~position[:, 1:].any(axis=1)].any():
@@ -173,7 +173,7 @@ def still_holds(
             f'bumped? {text}; call ~/clear, measure 8 poses or more, ~/identify, or run calib_ros '
             'identify --previous'
         )
-    if found.unexplained <= FALSE:
+    if found.unexplained <= FALSE_ALARM:
         return False, (
             f'{text}, more than the calibration in use and noise explain; no change of a few '
             'parameters explains it: call ~/clear, measure new poses and call ~/identify'

@@ -14,7 +14,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.ros import to_ros
-from calib_ros.ros.parameters import Given
+from calib_ros.ros.parameters import NodeValues
 
 
 class Broadcast:
@@ -25,7 +25,7 @@ class Broadcast:
     leads to the fixed target, and the tool to the camera.
     """
 
-    def __init__(self, node: Node, given: Given, urdf: str) -> None:
+    def __init__(self, node: Node, given: NodeValues, urdf: str) -> None:
         self._node, self._publisher = node, None
         self._names = given.base_frame, given.flange_frame, given.target_frame
         if not given.base_frame and not given.flange_frame:

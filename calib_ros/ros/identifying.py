@@ -22,7 +22,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.history import History
 from calib_ros.files.loading import Loaded
-from calib_ros.files.rows import Filing, Row, identified, inputs_of, samples_hash, settings_hash
+from calib_ros.files.rows import Filing, Row, inputs_of, result_row, samples_hash, settings_hash
 from calib_ros.identification.age import measured_at
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
@@ -197,7 +197,7 @@ class Identifying:
             if self._session.calibration is not None:
                 self.last += '; the last good calibration stays in use'
             self._keep_report(page)
-        row = partial(identified, result)
+        row = partial(result_row, result)
         self.last += self._filer.file(lambda: loaded.problem, given.settings, row)
         return result.accepted, self.last
 

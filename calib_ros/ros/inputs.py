@@ -42,7 +42,7 @@ machine. From a deeper queue Fast DDS drops the newest messages beyond 5,000, an
 
 
 @dataclass
-class Hearing:
+class TopicState:
     """State of one topic; times [s] are monotonic."""
 
     count: int = 0
@@ -93,7 +93,7 @@ class Hearing:
             self.continuous, self.last = self.continuous or quick, now
 
     @property
-    def gone(self) -> float:
+    def share_lost(self) -> float:
         """Return the share lost in transit if it is large, and as long as more is lost."""
         share = self.lost / max(self.lost + self.count, 1)
         return share if self.losing and share > EXCEPTION and self.lost >= NO_ACCIDENT else 0.0
@@ -122,7 +122,7 @@ class Inputs:
 
     def __init__(self, node: Node, streams: Sequence[Stream]) -> None:
         self._node = node
-        self._topics: dict[str, Hearing] = {}
+        self._topics: dict[str, TopicState] = {}
         self._looked_at = time.monotonic()
         self.failures: list[str] = []
         """Why topics give nothing, as text, at the last look."""
@@ -166,7 +166,7 @@ class Inputs:
             hearing.look(now, span)
         topics = self._topics.items()
         self.failures = [f'no more messages on {topic}' for topic, each in topics if each.silent]
-        gone = [(topic, 100.0 * each.gone) for topic, each in topics if each.gone]
+        gone = [(topic, 100.0 * each.share_lost) for topic, each in topics if each.share_lost]
         self.failures += [f'{share:.0f} % of {topic} is lost on the way' for topic, share in gone]
         self.failures += self._unheard()
         streams = [stream for stream, _ in self._inputs.values()]
@@ -175,7 +175,7 @@ class Inputs:
     def troubles(self) -> list[str]:
         """Return problems of topics as text."""
         topics = self._topics.items()
-        losing = ', '.join(topic for topic, each in topics if each.losing and not each.gone)
+        losing = ', '.join(topic for topic, each in topics if each.losing and not each.share_lost)
         return [*self.failures, *([f'messages are lost on {losing}'] if losing else [])]
 
     def figures(self) -> dict[str, Any]:
@@ -190,7 +190,7 @@ class Inputs:
                 found[f'queue of {topic} full'] = each.full
         return found
 
-    def _subscribe(self, stream: Stream) -> tuple[Subscription, tuple[Stream, Hearing]]:
+    def _subscribe(self, stream: Stream) -> tuple[Subscription, tuple[Stream, TopicState]]:
         policies = QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH, QoSPolicyKind.HISTORY
         try:
             name = self._node.resolve_topic_name(stream.topic)
@@ -202,7 +202,7 @@ class Inputs:
                 f'"{stream.topic}" is {name}, from which another input is taken: give each one '
                 'its own topic, and name it once'
             )
-        hearing = self._topics.setdefault(name, Hearing())
+        hearing = self._topics.setdefault(name, TopicState())
         hearing.latched = stream.still
         events = SubscriptionEventCallbacks(
             message_lost=lambda event: hearing.note_lost(event.total_count),
@@ -242,7 +242,7 @@ class Inputs:
                     event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
                     raw=True,
                 )
-                self._inputs[subscription] = stream, Hearing()  # the other one counts
+                self._inputs[subscription] = stream, TopicState()  # the other one counts
 
     def _unheard(self) -> list[str]:
         """Return why publishers are not heard, by topic, even if others on it are."""

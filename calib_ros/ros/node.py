@@ -31,7 +31,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.cameras import cameras_of
 from calib_ros.files.programs import read_joints
-from calib_ros.files.rows import judged
+from calib_ros.files.rows import validation_row
 from calib_ros.identification.age import years_since
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibration import recalibrate
@@ -131,15 +131,15 @@ class CalibrationNode(Batched):
             (Trigger, '~/capture', self._on_capture),
             (Trigger, '~/remove_last', self._on_remove_last),
             (Trigger, '~/clear', self._on_clear),
-            (Trigger, '~/load', partial(self._settled, self._on_load)),
+            (Trigger, '~/load', partial(self._unless_busy, self._on_load)),
             (SetBool, '~/record', self._on_record),
         ):
             self.create_service(kind, name, self._answering(name, callback))
         identify, keeper, whose = self._identifying, self._keeper, self._saying_whose
         slow: tuple[tuple[str, Callable[[], Any], Callable[[Any], Answer]], ...] = (
             ('~/identify', lambda: identify.snapshot(self._inputs), identify.run),
-            ('~/export', *whose(partial(self._settled, keeper.exportable), keeper.export)),
-            ('~/save', *whose(partial(self._settled, keeper.to_save), keeper.save)),
+            ('~/export', *whose(partial(self._unless_busy, keeper.exportable), keeper.export)),
+            ('~/save', *whose(partial(self._unless_busy, keeper.to_save), keeper.save)),
             ('~/check', *whose(self.session.recent, self._on_check)),
             ('~/validate', *whose(self._to_judge, self._on_validate)),
         )
@@ -268,7 +268,7 @@ class CalibrationNode(Batched):
         self._take_messages()
         return begin(*arguments)
 
-    def _settled(self, begin: Callable[..., Any], *arguments: Any) -> Any:
+    def _unless_busy(self, begin: Callable[..., Any], *arguments: Any) -> Any:
         if self._working['~/identify'].busy:
             raise InputError(
                 'refused: an identification is running, and may replace the calibration in use: '
@@ -317,7 +317,7 @@ class CalibrationNode(Batched):
         calibration, sets, filed = given
         found = compare(calibration.before, calibration.chain, sets)
         verdict, text = words.verdict(calibration, found, calibration.reused(sets), sets)
-        row = partial(judged, calibration.chain, *found.figures, verdict)
+        row = partial(validation_row, calibration.chain, *found.figures, verdict)
         return verdict == 'holds', text + filed(row, table_hash(calibration.chain))
 
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:

@@ -24,7 +24,7 @@ from calib_ros.kinematics.chain_file import chain_text, parse_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.ros import to_ros
 from calib_ros.ros.broadcast import Broadcast
-from calib_ros.ros.parameters import Given
+from calib_ros.ros.parameters import NodeValues
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
@@ -57,7 +57,7 @@ class Keeper:
         node: Node,
         session: CalibrationSession,
         archive: Archive,
-        given: Given,
+        given: NodeValues,
         urdf: str,
         adopted: Callable[[Calibration, str], None],
     ) -> None:

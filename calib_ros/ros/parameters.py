@@ -37,7 +37,7 @@ OF_ROS = ('use_sim_time', 'start_type_description_service')  # parameters declar
 DESCRIPTION_WAIT = 2.0 * SILENCE  # time [s] to wait for the robot's description
 
 
-class Given(SimpleNamespace):
+class NodeValues(SimpleNamespace):
     """Parameters by name, and the `settings`, as given at the start.
 
     Those that can change are read where they are used.
@@ -49,7 +49,7 @@ class Given(SimpleNamespace):
         return {'base_link': self.base_link or None, 'tip_link': self.tip_link or None}
 
 
-def declare_all(node: Node, shared: Collection[str]) -> tuple[Given, Sequence[str]]:
+def declare_all(node: Node, shared: Collection[str]) -> tuple[NodeValues, Sequence[str]]:
     """Declare all parameters of the node; return their values, and the names that were set.
 
     The node declares whatever is set, because rclpy lists it in no other way. Each parameter is
@@ -77,7 +77,7 @@ def declare_all(node: Node, shared: Collection[str]) -> tuple[Given, Sequence[st
         raise ConfigError('parameter "target_frame" must not be empty: name it, or leave it out')
     if own['socket']:
         socket_place(own['socket'])
-    return Given(**own, settings=settings), [*overrides]
+    return NodeValues(**own, settings=settings), [*overrides]
 
 
 def _is_ours(name: str) -> bool:
@@ -95,7 +95,7 @@ def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
     return replace(settings, **values)
 
 
-def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
+def load_robot(node: Node, given: NodeValues) -> tuple[Chain, str]:
     """Return the nominal chain, and its URDF if it comes from one."""
     name, links = os.path.expanduser(given.chain), given.links
     if name == 'robot_description':

@@ -84,7 +84,7 @@ TOO_LATE = 'measurements: later than lateness allows'
 TOO_MANY = f'measurements: beyond {MOST_NAMES} targets or frames'
 
 
-class Apart:
+class ClockOffset:
     """How far the stamps of a stream are from those of the joint states that come with them."""
 
     def __init__(self) -> None:
@@ -131,7 +131,7 @@ class Waiting(dict[StreamKey, Rows]):
     ) -> None:
         self._width, self._capacity = width, capacity
         self._dropped, self._kept = dropped, kept
-        self.apart: dict[StreamKey, Apart] = {}
+        self.apart: dict[StreamKey, ClockOffset] = {}
 
     @property
     def count(self) -> int:
@@ -157,7 +157,7 @@ class Waiting(dict[StreamKey, Rows]):
             if len(self) >= MOST_NAMES:
                 self._dropped[TOO_MANY] += len(stamps)
                 return False
-            self[key], self.apart[key] = Rows(self._width, self._capacity), Apart()
+            self[key], self.apart[key] = Rows(self._width, self._capacity), ClockOffset()
         rows = self[key]
         due = np.flatnonzero(stamps > after_ns)
         taken = due[: rows.capacity - rows.count]

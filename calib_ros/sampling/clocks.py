@@ -140,7 +140,7 @@ class Clocks:
         if now_ns is not None and 0 <= now_ns - self._searched_ns < 1e9 * LEAST_MOTION:
             return
         self._searched_ns = now_ns or 0
-        self._found = self._delay_of(*collector.known(now_ns))
+        self._found = self._delay_of(*collector.recent_series(now_ns))
         if self.delay is not None:
             collector.delay_ns = round(self.delay.seconds * 1e9)
         collector.holding = self.delay is None and now_ns is not None

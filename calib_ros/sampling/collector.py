@@ -22,7 +22,7 @@ from calib_ros.sampling.hints import Hint, apart, ended, restless, sparse
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.sampler import ROW_WIDTH, TWICE, Found, Numbered, Sampler
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Series, Slice, Stamps, StreamKey
-from calib_ros.sampling.stops import SAMPLED, Known, Rests, Schedule, seen_stops
+from calib_ros.sampling.stops import SAMPLED, Rests, SampledStops, Schedule, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.settings import Settings
 from calib_ros.values import MOST_NAMES
@@ -42,7 +42,7 @@ class Collector:
         self.settings = settings
         self._revolute = np.array(revolute, dtype=bool)
         self.track = Track(revolute, settings.max_gap, settings.joint_buffer)
-        self._known = Known(self._revolute, settings.pose_buffer)
+        self._known = SampledStops(self._revolute, settings.pose_buffer)
         self._lateness_ns = round(settings.lateness * 1e9)
         self._newest_ns = 0  # the last joint sample
         self._advanced_ns = 0  # the same at the last round
@@ -62,7 +62,7 @@ class Collector:
         self.unused: Counter[str] = Counter()  # measurements normally not used, by cause
         self.notes: Counter[str] = Counter()
 
-    def known(self, now_ns: int | None) -> tuple[Series, list[Series]]:
+    def recent_series(self, now_ns: int | None) -> tuple[Series, list[Series]]:
         """Return stamps and joint values, and stamps and rows (N, ROW_WIDTH) of waiting positions.
 
         Only complete ones, older than the stamp `now_ns` by `lateness`; None: all.
@@ -154,7 +154,7 @@ class Collector:
             return found
         return [restless(needed, self.settings.still)]
 
-    def astray(self) -> list[Hint]:
+    def clock_hints(self) -> list[Hint]:
         """Report clocks that differ or differed by too much, or joint states that have ended."""
         found = self.waiting.apart.values()
         if seconds := max((each.seconds for each in found), key=abs, default=0.0):
@@ -299,7 +299,7 @@ class Collector:
             where = self.track.at(np.sum(spans, axis=1) // 2, standing=True).joints
             for k, span, joints in zip(stops, spans, where, strict=True):
                 near = 2.0 * settings.still
-                if self._measured(*span) and self._known.meets(*span, joints, near):
+                if self._measured(*span) and self._known.seen_before(*span, joints, near):
                     plan.why[k] = SAMPLED
 
     def _measured(self, begin: int, end: int) -> bool:

@@ -38,7 +38,7 @@ class Gate:
         found = ((each.key, each.numbers) for *_, given in self._held for each in given.pieces)
         return {int(n[0, 0]) for key, n in found if isinstance(key, StreamKey) and key.images}
 
-    def through(self, given: Slice) -> Iterator[tuple[Slice, bool]]:
+    def admit(self, given: Slice) -> Iterator[tuple[Slice, bool]]:
         """Yield what may pass now, and whether the joints' clock was moved back before it.
 
         Held messages pass with a later message, in order of arrival.

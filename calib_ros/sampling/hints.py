@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib_ros.errors import InputError
-from calib_ros.estimation.configurations import SCATTER, configurations, distinct
+from calib_ros.estimation.configurations import SCATTER, configurations, count_distinct
 from calib_ros.estimation.levels import FEW, NEARER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -253,7 +253,8 @@ def frozen(samples: Sequence[Sample]) -> Hint | None:
     repeated = {
         id(each)
         for some in places.values()
-        if some[1:] and distinct(configurations(np.array([each.joints for each in some]))) > 1
+        if some[1:]
+        and count_distinct(configurations(np.array([each.joints for each in some]))) > 1
         for each in some
     }
     still = {id(each) for each in measured if each.count > 1 and not round(each.spread, 12)}

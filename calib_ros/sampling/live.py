@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib_ros.errors import CalibrationError
-from calib_ros.estimation.configurations import configurations, distinct
+from calib_ros.estimation.configurations import configurations, count_distinct
 from calib_ros.estimation.fitting import SOME
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE, Prior, normal_equations
@@ -104,7 +104,7 @@ class LiveEstimate:
 
     def _updated(self, samples: Sequence[Sample]) -> Update:
         some = _spread(samples)
-        if distinct(configurations(np.array([each.joints for each in some]))) < START:
+        if count_distinct(configurations(np.array([each.joints for each in some]))) < START:
             return Update()
         try:
             problem = self._problem_of(some)
@@ -127,8 +127,8 @@ def _fitted(problem: Problem, samples: Sequence[Sample], count: int) -> Update:
         robust = robust_fit(robust.fit.chain, names, system, 'none')
     chain, sigmas = robust.fit.chain, (problem.sigma_position, problem.sigma_orientation)
     good = [
-        near | _within(residual_arrays(chain, each), sigmas)
-        for near, each in zip(robust.good, problem.sets, strict=True)
+        near | _not_gross(residual_arrays(chain, each), sigmas)
+        for near, each in zip(robust.inliers, problem.sets, strict=True)
     ]
     kept = system.select(good)
     normal = normal_equations(chain, names, kept)
@@ -144,7 +144,9 @@ def _fitted(problem: Problem, samples: Sequence[Sample], count: int) -> Update:
     out = [some[~near] for some, near in zip(members, good, strict=True)]
     gross = np.sort(np.concatenate(out)).tolist()
     spreads = np.array([each.spread for each in samples])
-    rms, ratio = _left(chain, problem.sets, [spreads[some] for some in members], good, sigmas[0])
+    rms, ratio = _rms_residuals(
+        chain, problem.sets, [spreads[some] for some in members], good, sigmas[0]
+    )
     estimate = Estimate(
         chain=chain,
         names=names,
@@ -167,13 +169,13 @@ def _priors(problem: Problem, names: Sequence[str]) -> Prior:
     return Prior(problem.model, {**wide, **problem.prior_sigmas})
 
 
-def _within(left: Sequence[FloatArray], sigmas: tuple[float, float]) -> Flags:
+def _not_gross(left: Sequence[FloatArray], sigmas: tuple[float, float]) -> Flags:
     """Return which residuals (N, 3) of position and orientation no sigma makes gross."""
     (position, turn), (length, angle) = left, sigmas  # a turn that is not measured is NaN
     return (norms(position) <= OUTER * length) & ~(norms(turn) > OUTER * angle)
 
 
-def _left(
+def _rms_residuals(
     chain: Chain,
     sets: Sequence[Observations],
     spreads: Sequence[FloatArray],

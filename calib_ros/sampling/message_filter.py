@@ -84,7 +84,7 @@ class JointNames:
         return tuple(sorted(name or '""' for name in self._heard)) if self.never else ()
 
     @property
-    def missed(self) -> list[str]:
+    def extra_joints(self) -> list[str]:
         """Return the names of joints that move but are not in the chain."""
         moved = {name for name, (low, high) in self._heard.items() if high - low > STILL}
         return sorted(moved.difference(self._names))

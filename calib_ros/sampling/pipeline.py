@@ -41,7 +41,7 @@ class Pipeline:
     def take(self, pieces: Sequence[Piece]) -> None:
         """Take messages; an error loses only the slice that causes it."""
         if pieces:
-            self._pass(self.gate.through(Slice.of(pieces, self._delay_ns)))
+            self._pass(self.gate.admit(Slice.of(pieces, self._delay_ns)))
 
     def finish(self) -> None:
         """Make samples of all waiting messages; no more will arrive."""
@@ -63,7 +63,7 @@ class Pipeline:
 
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the stamps, given the number of measurements."""
-        found = self.collector.astray() or self.clocks.hints()
+        found = self.collector.clock_hints() or self.clocks.hints()
         return found + self.clocks.stuck() + self.collector.hints(measurements)
 
     def unsettled(self) -> list[Hint]:

@@ -209,7 +209,7 @@ class CalibrationSession:
         notes = collector.notes.copy()
         if left_out := len(self.samples) - len(usable):
             notes['poses left out, in another frame or of a target measured once'] += left_out
-        if missed := self._names.missed:
+        if missed := self._names.extra_joints:
             names = ', '.join(some(missed))
             notes[f'joint that moves but is not in the chain: {names}'] = len(missed)
         return Account(

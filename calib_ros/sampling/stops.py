@@ -189,7 +189,7 @@ class Schedule:
         self.add(until, MOVING)
 
 
-class Known:
+class SampledStops:
     """Sampled stops: after the clock jumped back, they are not sampled again."""
 
     def __init__(self, revolute: Flags, capacity: int) -> None:
@@ -197,7 +197,7 @@ class Known:
         self._stops = Rows(1 + len(revolute), capacity)  # length and joint values
         self._last_ns = 0  # latest end
 
-    def meets(self, begin: int, end: int, where: FloatArray, near: float) -> bool:
+    def seen_before(self, begin: int, end: int, where: FloatArray, near: float) -> bool:
         """Tell whether a stop at joint values (n,) was sampled before; remember it if not."""
         if begin <= self._last_ns:
             begins, lengths = self._stops.stamps, self._stops.values[:, 0]

@@ -45,7 +45,7 @@ class Route(NamedTuple):
 
 
 @dataclass
-class Seen:
+class LinkCount:
     """Count of a moving link, with its first and last stamp."""
 
     count: int
@@ -70,7 +70,7 @@ class Links:
         self.kind = kind
         self.sources = tuple(sources)
         self._fixed: dict[Pair, FloatArray] = {}
-        self._moving: dict[Pair, Seen] = {}
+        self._moving: dict[Pair, LinkCount] = {}
         self._changed: set[Pair] = set()
         self._routes: dict[Source, Route | str] = dict.fromkeys(sources, '')
         self._parents = defaultdict[str, list[Pair]](list)  # links by child frame
@@ -97,12 +97,12 @@ class Links:
         found = [
             self._measured(s, route, waited)._replace(places=np.full(len(waited.places), first))
             for waited in self._held
-            for s, route in self._of(waited.strings)
+            for s, route in self._routes_of(waited.strings)
             if s in open_before
         ]
         is_open = '' in self._routes.values()  # frames of a source are not linked yet
         for part in moving:
-            measured = self._of(part.strings)
+            measured = self._routes_of(part.strings)
             if not (is_open or measured):
                 continue
             good, causes = usable(part)
@@ -111,7 +111,7 @@ class Links:
             self._held.append(read)
             found += [self._measured(s, route, read) for s, route in measured]
         if not is_open:
-            lost_count = sum(n * len(self._of(link)) for link, n in self._let_go.items())
+            lost_count = sum(n * len(self._routes_of(link)) for link, n in self._let_go.items())
             faults += Counter({'buffer full before their frames were linked': lost_count})
             self._let_go.clear()
             self._held.clear()
@@ -136,9 +136,9 @@ class Links:
             if len(self._moving) == MOST_ENTRIES:  # a tracker may number its markers without end
                 self._update()
                 for each in [*self._moving][: MOST_ENTRIES // 2]:
-                    if not self._of(each):
+                    if not self._routes_of(each):
                         del self._moving[each]
-            self._moving[link] = Seen(0, first_ns, last_ns)
+            self._moving[link] = LinkCount(0, first_ns, last_ns)
             self._known = False
         seen = self._moving[link]
         seen.count += len(come.places)
@@ -161,7 +161,7 @@ class Links:
             return f'nothing moves on {self.topic}'
         self._update()
         # links of an arm have moving ones above or below, others stand alone
-        above = {parent: self._above(parent)[0] for parent, _ in self._moving}
+        above = {parent: self._ancestors(parent)[0] for parent, _ in self._moving}
         parents = {frame for frames in above.values() for frame in frames}
         alone = {
             (parent, child)
@@ -188,7 +188,7 @@ class Links:
 
     # Details
 
-    def _of(self, link: Pair) -> list[tuple[Source, Route]]:
+    def _routes_of(self, link: Pair) -> list[tuple[Source, Route]]:
         routes = self._routes.items()
         return [(s, r) for s, r in routes if isinstance(r, Route) and r.link == link]
 
@@ -229,8 +229,8 @@ class Links:
         for link, inverse in (((parent, child), False), ((child, parent), True)):
             if link in self._moving:  # a direct measurement takes precedence
                 return [(link, inverse)]
-        first, ambiguous = self._above(child)
-        second, also = self._above(parent)
+        first, ambiguous = self._ancestors(child)
+        second, also = self._ancestors(parent)
         common = next((frame for frame in first if frame in second), None)
         if common is None:
             return ambiguous or also
@@ -238,7 +238,7 @@ class Links:
         up = [(self._parents[frame][0], True) for frame in second[: second.index(common)]]
         return [*up, *reversed(down)]
 
-    def _above(self, frame: str) -> tuple[list[str], str]:
+    def _ancestors(self, frame: str) -> tuple[list[str], str]:
         """Return a frame and its ancestors, and what is wrong with the last one, if anything."""
         frames = [frame]
         while links := self._parents[frames[-1]]:

@@ -12,7 +12,7 @@ from commanded import CELL, missed, regular
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.program import Program, compensate_program
 from calib_ros.apply.simulation import faulty
-from calib_ros.apply.verification import _meant
+from calib_ros.apply.verification import _match_commands
 from calib_ros.errors import InputError
 from calib_ros.files.programs import program_of, read_joints
 from calib_ros.kinematics.chain import Chain, Joint
@@ -97,7 +97,7 @@ def test_measurements_find_their_command_whatever_is_reported_of_it(compensator,
     q, _ = path
     measured = compensate(compensator, q).joints.copy()
     measured[:, HAND] = -q[:, 1] - q[:, 2]
-    commanded, corrected = _meant(PALLETISER, compensator.calibrated, measured, q)
+    commanded, corrected = _match_commands(PALLETISER, compensator.calibrated, measured, q)
     np.testing.assert_array_equal(commanded, q)
     assert corrected.all()
 

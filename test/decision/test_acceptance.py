@@ -77,7 +77,7 @@ def test_a_tool_that_points_one_way_is_told(rng, tilt, told):
     q = chain.random_joints(400, rng)
     q[:, 0] = 0.5 * np.pi * rng.integers(4, size=400)
     problem = SimpleNamespace(chain=chain, sets=[SimpleNamespace(joints=q)])
-    assert ('points one way' in acceptance._together(problem)) == told
+    assert ('points one way' in acceptance._idle_joints(problem)) == told
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_joints_that_the_poses_do_not_move_apart_are_told(still, alike, apart, t
         q[:, alike] = q[:, alike[:1]] + apart * STILL * rng.normal(size=(40, len(alike)))
         q[:, alike] += 0.5 * np.arange(len(alike))
     problem = SimpleNamespace(chain=UR10E, sets=[SimpleNamespace(joints=q)])
-    said = acceptance._together(problem)
+    said = acceptance._idle_joints(problem)
     assert told in said
     assert bool(said) == bool(told)
 

@@ -9,7 +9,7 @@ from fits import arm
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Camera, before_camera, photograph
-from calib_ros.decision.mistakes import explained
+from calib_ros.decision.mistakes import diagnose
 from calib_ros.decision.reasons import Rule
 from calib_ros.kinematics.chain import Frame
 
@@ -113,7 +113,7 @@ def test_linear_joints_in_millimetres_are_named_of_images_as_well():
 def test_another_order_of_the_joints_is_corrected_in_the_table_of_places():
     seen = images(True)
     mixed = replace(seen, joints=seen.joints[:, [2, 0, 4, 1, 5, 3]])
-    (found,) = explained(Problem(nominal(True), mixed)).suspects
+    (found,) = diagnose(Problem(nominal(True), mixed)).suspects
     assert found.what.startswith('the joint values are in the order elbow_joint, shoulder_pan_j')
     assert found.remedy == 'correct it in --places'
 

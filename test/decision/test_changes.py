@@ -14,14 +14,14 @@ from calib_ros import load_chain
 from calib_ros.decision import changes
 from calib_ros.decision.changes import (
     SCALE_OF_DEVICE,
-    Effects,
+    ChangeColumns,
     Explanation,
     Information,
+    gauge_columns,
     likelier,
     mean_square_change,
     reasons_of,
     root_of,
-    shown,
 )
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.levels import chance_of
@@ -34,7 +34,7 @@ from calib_ros.settings import LEVER
 @pytest.mark.parametrize(('frames', 'owners'), [((), {'elbow'}), (('tool',), {'elbow', 'quill'})])
 def test_frames_that_cannot_have_moved_take_what_they_can(frames, owners):
     """A tilted quill moves its tip as the elbow does, and as another tool would."""
-    found = Effects(SCARA, [Parameter('elbow.theta')], frames)
+    found = ChangeColumns(SCARA, [Parameter('elbow.theta')], frames)
     assert {owner for owner, _ in found.sets} == owners
 
 
@@ -49,7 +49,7 @@ def test_all_that_a_bent_link_moves_is_one_change(arm, row):
     model, walked = ErrorModel(chain, [*frames, *names]), np.empty((len(q[0]) + 1, 4, 3, len(q)))
     rows, places = model.jacobian(q), chain.forward(q)[:, :3, 3].T
     chain.walk.frames(chain.effective(q.T), np.eye(4), walked)
-    columns = Effects(chain, names)
+    columns = ChangeColumns(chain, names)
     for k in range(1, len(chain.joints) - 2):
         axes, place = walked[k + 1, :3], walked[k + 1, 3]
         turned = [np.cross(axis, places - place, axis=0) for axis in axes]
@@ -64,10 +64,10 @@ def test_all_that_a_bent_link_moves_is_one_change(arm, row):
 
 def test_another_height_of_the_target_shows_as_one_of_the_device():
     names = [Parameter('elbow.theta'), Parameter('base.z')]
-    assert shown(SCARA, names, [Parameter('tool.z')])[0] == 0.0
-    assert abs(shown(SCARA, names, [Parameter('tool.z')])[1]) == pytest.approx(1.0)
-    assert shown(SCARA, names, [Parameter('tool.x')]).shape == (2, 0)
-    assert shown(SCARA, names, names[1:]).T.tolist() == [[0.0, 1.0]]
+    assert gauge_columns(SCARA, names, [Parameter('tool.z')])[0] == 0.0
+    assert abs(gauge_columns(SCARA, names, [Parameter('tool.z')])[1]) == pytest.approx(1.0)
+    assert gauge_columns(SCARA, names, [Parameter('tool.x')]).shape == (2, 0)
+    assert gauge_columns(SCARA, names, names[1:]).T.tolist() == [[0.0, 1.0]]
 
 
 @pytest.mark.parametrize(
@@ -80,16 +80,18 @@ def test_another_height_of_the_target_shows_as_one_of_the_device():
 )
 def test_turns_count_where_those_of_the_target_are_known(names, free, lever, monkeypatch):
     told = []
-    follow = changes.followed
-    monkeypatch.setattr(changes, 'followed', lambda *x, **y: told.append(x[4]) or follow(*x, **y))
-    changes.gauged(SCARA, [*map(Parameter, names)], [Parameter('arm.theta')], free)
+    follow = changes.best_imitation
+    monkeypatch.setattr(
+        changes, 'best_imitation', lambda *x, **y: told.append(x[4]) or follow(*x, **y)
+    )
+    changes.gauge_map(SCARA, [*map(Parameter, names)], [Parameter('arm.theta')], free)
     assert told == [lever]
 
 
 def test_play_shows_in_no_other_parameter():
     names = [Parameter(joint.name, 'theta') for joint in UR10E.joints]
     play = Parameter('elbow_joint', 'backlash')
-    taken, left = changes.gauged(UR10E.with_effects([play]), names, [play], True)
+    taken, left = changes.gauge_map(UR10E.with_effects([play]), names, [play], True)
     assert np.abs(taken).max() < 0.2  # equally often either way
     assert left == pytest.approx(1.0, abs=0.05)
 
@@ -109,7 +111,7 @@ def test_a_change_is_as_large_as_its_evidence_tells(kind, size, times):
     """The evidence is that of one number, here known to a tenth of 1 mm or 2 mrad."""
     name, known = Parameter('elbow', kind), 10.0 / (1e-3 if kind == 'a' else 2e-3)
     found = np.array([[known**2]]), np.array([10.0 * known * size])
-    evidence, told = Effects(SCARA, [name]).evidence(Information((name,), *found), [name])
+    evidence, told = ChangeColumns(SCARA, [name]).evidence(Information((name,), *found), [name])
     assert told == times
     spread = 1.0 + 100.0 * times**2
     gain = 100.0**2 * size**2 * times**2 / spread
@@ -173,7 +175,7 @@ def test_an_explanation_gains_what_a_fit_along_its_columns_does(rng):
 
 def test_of_parameters_with_one_effect_the_first_is_named_and_only_then():
     """Of any size and sign; 37 degrees away from it is another."""
-    columns = Effects(UR10E, THREE)
+    columns = ChangeColumns(UR10E, THREE)
     effects = ([1.0, 0.0, 0.0], [0.8, 0.6, 0.0], [-2.0, 0.0, 0.0])
     columns._columns = dict(zip(THREE, map(np.array, effects), strict=True))
     assert columns._distinct(THREE) == THREE[:2]
@@ -181,12 +183,12 @@ def test_of_parameters_with_one_effect_the_first_is_named_and_only_then():
 
 def test_the_scale_of_the_device_is_that_of_all_lengths():
     names = [*THREE, Parameter('elbow_joint.a'), Parameter('wrist_1_joint.d')]
-    found = Effects(UR10E, names, scaled=True)
+    found = ChangeColumns(UR10E, names, scaled=True)
     assert found.sets[-1] == ('device', (changes.SCALE_OF_DEVICE,))
     (grown,) = found.of((changes.SCALE_OF_DEVICE,)).T
     np.testing.assert_allclose(grown[3:], [UR10E.joints[2].a, UR10E.joints[3].d], rtol=1e-3)
-    assert found.unscaled().sets == found.sets[:-1] == Effects(UR10E, names).sets
-    assert not any(owner == 'device' for owner, _ in Effects(UR10E, THREE, scaled=True).sets)
+    assert found.unscaled().sets == found.sets[:-1] == ChangeColumns(UR10E, names).sets
+    assert not any(owner == 'device' for owner, _ in ChangeColumns(UR10E, THREE, scaled=True).sets)
 
 
 @pytest.mark.parametrize(
@@ -199,7 +201,7 @@ def test_the_scale_of_the_device_is_that_of_all_lengths():
     ],
 )
 def test_the_fewest_zeros_that_explain_all_are_likelier(change, first, wanted, rng):
-    information, columns = known(rng, np.array(change)), Effects(UR10E, THREE)
+    information, columns = known(rng, np.array(change)), ChangeColumns(UR10E, THREE)
     one = SimpleNamespace
     given = [(one(names=(THREE[k],)),) for k in first]
     found = likelier(information, columns, 100.0, given)
@@ -216,7 +218,7 @@ def test_the_fewest_zeros_that_explain_all_are_likelier(change, first, wanted, r
 
 @pytest.mark.parametrize('size', [1e-6, 2e-5, 3e-5])
 def test_the_chance_of_an_explanation_is_that_of_all_that_are_tried(size, rng):
-    information, columns = known(rng, np.array([0.0, size, 0.0])), Effects(UR10E, THREE)
+    information, columns = known(rng, np.array([0.0, size, 0.0])), ChangeColumns(UR10E, THREE)
     (best, *_) = reasons_of(information, columns, 50.0, most=1.0)
     gain, change, covariance, rank = information.explained(columns.of(best.names))
     assert best.chance == min(1.0, len(columns.sets) * chance_of(gain, rank, 50.0))
@@ -226,7 +228,10 @@ def test_the_chance_of_an_explanation_is_that_of_all_that_are_tried(size, rng):
 
 def test_what_is_outside_the_arm_is_tried_as_often_as_the_joint_that_is_tried_most(rng):
     names = [*THREE, Parameter('elbow_joint.a'), Parameter('wrist_1_joint.d')]
-    information, columns = known(rng, np.zeros(5), names=names), Effects(UR10E, names, scaled=True)
+    information, columns = (
+        known(rng, np.zeros(5), names=names),
+        ChangeColumns(UR10E, names, scaled=True),
+    )
     tried = Counter(owner for owner, _ in columns.sets)
     tried['device'] = max(tried.values())
     odds = [columns.evidence(information, each)[0] for _, each in columns.sets]
@@ -241,7 +246,7 @@ def test_the_zeros_of_all_joints_are_one_change(rng):
     names = [joint.driven for joint in UR10E.joints[1:5]]
     information = known(rng, np.full(4, 3e-3), names=names)
     given = [(SimpleNamespace(names=(names[0],)),)]
-    ((found,),) = likelier(information, Effects(UR10E, names), 100.0, given)
+    ((found,),) = likelier(information, ChangeColumns(UR10E, names), 100.0, given)
     assert (found.owner, list(found.names)) == ('all joints', names)
 
 
@@ -251,7 +256,7 @@ def test_one_change_more_must_be_likelier_than_any_of_as_many(count, choices, od
     """All zeros count as one more than any three of them, a link with parts of the next once."""
     names = [joint.driven for joint in UR10E.joints[1 : 1 + count]]
     names += [Parameter('elbow_joint.a'), Parameter('elbow_joint.alpha')]
-    columns, matrix = Effects(UR10E, names), 1e10 * np.eye(count + 2)
+    columns, matrix = ChangeColumns(UR10E, names), 1e10 * np.eye(count + 2)
     change = np.array([*[3e-3] * (count - 1), 0.0, 0.0, 0.0])
 
     def evidence(size):

@@ -13,7 +13,7 @@ from calib_ros.decision import rounding
 from calib_ros.decision.rounding import rounded_joints, rounding_errors
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.leastsquares import owners, stacked
+from calib_ros.estimation.leastsquares import row_samples, stacked
 from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification import identification
@@ -176,7 +176,7 @@ def test_whether_rounding_explains_the_gain_is_an_f_test(rng, monkeypatch):
     )
     own = [name for name in fitted.names if name not in frames]
     parts = problem.system(problem.sets).rows_of(before, [*frames, *own])
-    rows, level = stacked(parts), level[owners(parts)]
+    rows, level = stacked(parts), level[row_samples(parts)]
     shared = rows[:, [[*frames, *own].index('elbow_joint.theta')]] * 1e-3 / np.sqrt(12.0)
     covariance = np.eye(len(rows)) + shared @ shared.T * (level == level[:, np.newaxis])
     white = np.linalg.solve(np.linalg.cholesky(covariance), rows)

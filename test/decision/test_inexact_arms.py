@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import Problem, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision.mistakes import explained
+from calib_ros.decision.mistakes import diagnose
 
 ARM = load_chain('ur10e')
 
@@ -35,11 +35,11 @@ def as_vectors(each):
     ],
 )
 def test_mistakes_are_named_although_the_arm_is_worse_than_faulty_ones(spoilt, remedy):
-    found = explained(Problem(ARM, spoilt(seen_of(ARM))))
+    found = diagnose(Problem(ARM, spoilt(seen_of(ARM))))
     assert remedy in str(found)
     assert 0.02 < found.corrected < 0.04
 
 
 def test_of_an_arm_with_another_forearm_no_mistake_is_named():
     rows = [replace(each, a=1.6 * each.a) if k == 2 else each for k, each in enumerate(ARM.joints)]
-    assert explained(Problem(ARM, seen_of(replace(ARM, joints=tuple(rows))))) is None
+    assert diagnose(Problem(ARM, seen_of(replace(ARM, joints=tuple(rows))))) is None

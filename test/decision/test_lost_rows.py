@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from calib_ros import Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision import lost_rows
-from calib_ros.decision.lost_rows import _apart, _where, row_loss
+from calib_ros.decision.lost_rows import _sides_differ, _where, row_loss
 from calib_ros.decision.misfits import zero_of_distances
-from calib_ros.decision.mistakes import explained
+from calib_ros.decision.mistakes import diagnose
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.levels import LEAST_ASIDE
 from calib_ros.kinematics.chain_file import load_chain
@@ -44,7 +44,7 @@ def test_rows_lost_in_one_of_two_tables_are_named(positions, joints, said, orien
 def test_the_error_once_corrected_tells_nothing_where_most_rows_are_right(row, told):
     *_, seen = measured_arm(1, 40, oriented=False)
     kept = replace(seen.select(np.delete(np.arange(40), [row, 39])), joints=seen.joints[:-2])
-    found = explained(Problem(UR10E, kept))
+    found = diagnose(Problem(UR10E, kept))
     assert f'from line {row + 2} on' in found.suspects[0].what
     assert (found.corrected < 1e-2) == told
 
@@ -96,8 +96,8 @@ def test_each_side_of_a_lost_row_fits_by_its_own_shift(own, other, found, first)
     far[1 - which, side][:other] = 0.0
     far[1 - which, rest] = 0.0
     row = 20 if first else LEAST_ASIDE
-    assert _apart(*far, row, 0.5) == found
-    assert not _apart(*far[:, :-1] if first else far[:, 1:], row - (not first), 0.5)
+    assert _sides_differ(*far, row, 0.5) == found
+    assert not _sides_differ(*far[:, :-1] if first else far[:, 1:], row - (not first), 0.5)
 
 
 @pytest.mark.parametrize('oriented', [True, False])
@@ -107,7 +107,7 @@ def test_any_order_of_the_joints_is_named(name, oriented):
     true = faulty(chain, Cell(), rng)
     seen = measure(true, chain.random_joints(40, rng), rng, *NOISE, oriented)
     order = rng.permutation(len(chain.joints))
-    found = explained(Problem(chain, replace(seen, joints=seen.joints[:, order])))
+    found = diagnose(Problem(chain, replace(seen, joints=seen.joints[:, order])))
     back = np.argsort(order)
     columns = ','.join(f'q{k + 1}=q{place + 1}' for k, place in enumerate(back))
     assert found.suspects[0].remedy == f'--columns {columns}'
@@ -139,7 +139,7 @@ def test_a_source_that_repeats_its_last_value_is_named(part, rows_of):
 def test_one_coordinate_in_another_unit_is_named(size):
     *_, seen = measured_arm(1, 30, oriented=size > 1.0)
     positions = seen.positions * [1.0, size, 1.0]
-    found = explained(Problem(UR10E, replace(seen, positions=positions)))
+    found = diagnose(Problem(UR10E, replace(seen, positions=positions)))
     assert found.suspects[0].remedy == f'--columns y=y*{1.0 / size:g}'
 
 
@@ -148,13 +148,13 @@ def test_one_coordinate_in_another_unit_is_named(size):
 )
 def test_coordinates_of_the_positions_alone_in_another_order_are_named(axes, option):
     *_, seen = measured_arm(1, 30)
-    found = explained(Problem(UR10E, replace(seen, positions=seen.positions[:, axes])))
+    found = diagnose(Problem(UR10E, replace(seen, positions=seen.positions[:, axes])))
     assert f'--columns {option}' in [each.remedy for each in found.suspects]
 
 
 def test_a_coordinate_of_the_positions_alone_that_counts_the_other_way_is_named():
     *_, seen = measured_arm(1, 30)
-    found = explained(Problem(UR10E, replace(seen, positions=seen.positions * [1.0, 1.0, -1.0])))
+    found = diagnose(Problem(UR10E, replace(seen, positions=seen.positions * [1.0, 1.0, -1.0])))
     assert [each.remedy for each in found.suspects] == ['--columns x=x,y=y,z=-z']
 
 
@@ -163,7 +163,7 @@ def test_euler_angles_about_fixed_axes_in_the_order_of_their_columns_are_named()
     *_, seen = measured_arm(1, 30)
     angles = Rotation.from_matrix(seen.rotations).as_euler('xyz')
     wrong = Rotation.from_euler('ZYX', angles).as_matrix()
-    (found,) = explained(Problem(UR10E, replace(seen, rotations=wrong))).suspects
+    (found,) = diagnose(Problem(UR10E, replace(seen, rotations=wrong))).suspects
     assert 'reverse the letters of --euler' in found.remedy
 
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision.lost_rows import dead
-from calib_ros.decision.mistakes import explained
+from calib_ros.decision.lost_rows import constant_axes
+from calib_ros.decision.mistakes import diagnose
 from calib_ros.decision.rotation_conventions import misread
 from calib_ros.decision.undoing import mirrored, scaled
 from calib_ros.kinematics import se3
@@ -142,7 +142,7 @@ POSITIONS_TELL = ('mm', 'both, and a lost beam', 'left-handed', 'sign', 'coupled
 )
 def test_mistakes_are_named_with_the_option_to_give(mistake, oriented):
     change, remedy = SPOILT[mistake]
-    found = explained(Problem(UR, change(seen_of(oriented=oriented))))
+    found = diagnose(Problem(UR, change(seen_of(oriented=oriented))))
     assert remedy in str(found)
     assert len(found.suspects) <= 2
     assert 5.0 * found.corrected < found.given
@@ -158,7 +158,7 @@ def test_a_joint_that_comes_before_the_device_or_behind_the_target_is_named(numb
     q[:, number] = 0.0
     seen = measure(faulty(arm, Cell(), rng), q, rng, 5e-5, 2e-4, bool(number))
     q[:, number] = rng.uniform(0.0, 2.0, 40)
-    found = explained(Problem(arm, replace(seen, joints=q))).suspects[0]
+    found = diagnose(Problem(arm, replace(seen, joints=q))).suspects[0]
     assert f'with {arm.joint_names[number]}' in found.what
     assert f'q{number + 1}=0' in found.remedy
 
@@ -180,7 +180,7 @@ def test_a_wrong_order_of_angles_is_named_where_the_tool_hardly_turns():
     seen = measure(faulty(UR, Cell(), rng), q, rng, 5e-5, 2e-4)
     turn = seen.rotations[0].T
     near_none = replace(seen, rotations=turn @ seen.rotations, positions=seen.positions @ turn.T)
-    found = explained(Problem(UR, rewritten('ZYX', 'XYZ')(near_none)))
+    found = diagnose(Problem(UR, rewritten('ZYX', 'XYZ')(near_none)))
     assert '--euler XYZ, ' in str(found)
 
 
@@ -230,7 +230,7 @@ SEVERAL = {
 )
 def test_mistakes_made_at_once_are_named(mistakes, oriented):
     change, said = SEVERAL[mistakes]
-    found = str(explained(Problem(UR, change(seen_of(oriented=oriented)))))
+    found = str(diagnose(Problem(UR, change(seen_of(oriented=oriented)))))
     assert found.startswith('several mistakes at once: ')
     for each in said:
         assert each in found
@@ -239,7 +239,7 @@ def test_mistakes_made_at_once_are_named(mistakes, oriented):
 def test_a_joint_with_another_sign_and_zero_is_named():
     seen = seen_of(oriented=False)
     turned = replace(seen, joints=SIGNS * seen.joints + np.eye(6)[2] * np.pi / 2)
-    found = str(explained(Problem(UR, turned)))
+    found = str(diagnose(Problem(UR, turned)))
     assert 'elbow_joint counts the other way round and has its zero 90 degrees away' in found
     said = (
         'sign: -1 and theta +90 degrees in the chain file, or --columns q3=-q3+1.570796326794897'
@@ -260,7 +260,7 @@ def test_linear_joints_in_millimetres_are_named(travel, positions, remedy):
     seen = seen_of(rail)
     sizes = [travel if joint.type == 'prismatic' else 1.0 for joint in rail.joints]
     spoilt = replace(seen, joints=seen.joints * sizes, positions=positions * seen.positions)
-    assert remedy in str(explained(Problem(rail, spoilt)))
+    assert remedy in str(diagnose(Problem(rail, spoilt)))
 
 
 def test_another_robot_and_the_other_convention_are_named():
@@ -268,9 +268,9 @@ def test_another_robot_and_the_other_convention_are_named():
     sister = load_chain('ur5e')
     shifted = replace(sister, joints=(replace(sister.joints[0], b=1e-3), *sister.joints[1:]))
     for chain in (sister, shifted):
-        assert '--chain ur10e' in str(explained(Problem(chain, seen)))
+        assert '--chain ur10e' in str(diagnose(Problem(chain, seen)))
     other = replace(UR, convention='modified', parallel=None)
-    assert 'convention: standard' in str(explained(Problem(other, seen)))
+    assert 'convention: standard' in str(diagnose(Problem(other, seen)))
 
 
 @pytest.mark.parametrize('b', [0.0, 0.3])
@@ -295,7 +295,7 @@ def test_orientations_that_do_not_fit_are_a_remark_where_the_rest_is_accepted(st
 
 def test_another_robot_in_messages_is_named_as_the_chain_to_set():
     problem = Problem(load_chain('ur5e'), seen_of(), of_messages=True)
-    assert 'set chain (--chain) to ur10e (' in str(explained(problem))
+    assert 'set chain (--chain) to ur10e (' in str(diagnose(problem))
 
 
 @pytest.mark.parametrize('held', [False, True])
@@ -303,7 +303,7 @@ def test_a_mistake_of_one_of_two_devices_is_named_with_its_frame(held):
     base = faulty(UR, Cell(), np.random.default_rng(1)).base  # that of `seen_of`
     first, second = seen_of(), SPOILT['mm'][0](seen_of())
     chain = replace(UR, base=replace(base, fixed=held), frames=(('base_2', None),))
-    found = explained(Problem(chain, first, more=[replace(second, base='base_2')]))
+    found = diagnose(Problem(chain, first, more=[replace(second, base='base_2')]))
     assert str(found).startswith('in the measurements with base_2 alone, the positions are in mm')
 
 
@@ -319,7 +319,7 @@ def test_where_nothing_is_wrong_nothing_is_said(rng):
     mixed = replace(poses, joints=rng.permutation(poses.joints))
     noisy = replace(places, positions=places.positions + rng.normal(scale=0.2, size=(24, 3)))
     for seen in (poses, places, mixed, noisy):
-        assert explained(Problem(UR, seen)) is None
+        assert diagnose(Problem(UR, seen)) is None
 
 
 def test_motor_angles_of_a_small_arm_are_refused_whatever_its_error():
@@ -345,7 +345,7 @@ def test_mistakes_are_named_where_some_orientations_are_missing():
     seen = seen_of()
     some = np.arange(len(seen)) % 2 == 0
     partly = replace(seen, oriented=some, positions=1e3 * seen.positions)
-    assert '--length mm' in str(explained(Problem(UR, partly)))
+    assert '--length mm' in str(diagnose(Problem(UR, partly)))
 
 
 @pytest.mark.parametrize(('read', 'meant'), [('XYZ', 'ZYX'), ('ZXY', 'XYZ'), ('XYZ', 'YXZ')])
@@ -367,7 +367,7 @@ def test_one_joint_in_another_unit_than_the_others_is_named(joint, oriented):
     ):
         mixed = seen.joints.copy()
         mixed[:, joint] *= factor
-        said = str(explained(Problem(UR, replace(seen, joints=mixed))))
+        said = str(diagnose(Problem(UR, replace(seen, joints=mixed))))
         assert said.startswith(f'{UR.joint_names[joint]} {words}: --columns q{joint + 1}=')
 
 
@@ -381,7 +381,7 @@ def test_columns_that_never_change_are_named(columns, words, oriented):
     assert f'same {words}, though the arm moves in all directions: give the column {words}' in told
     if oriented:  # of a camera on the flange, after two poses of another one
         held = replace(seen, positions=places).inverted()
-        assert f'the same {words}, though' in dead(UR, (held.select([0, 1]), held)).what
+        assert f'the same {words}, though' in constant_axes(UR, (held.select([0, 1]), held)).what
 
 
 def test_a_planar_arm_square_to_the_device_has_no_dead_column():
@@ -390,7 +390,7 @@ def test_a_planar_arm_square_to_the_device_has_no_dead_column():
     rng = np.random.default_rng(0)
     seen = measure(chain, chain.random_joints(40, rng), rng, 0.0, 0.0, oriented=False)
     assert np.ptp(seen.positions[:, 2]) == 0.0
-    assert dead(chain, (seen,)) is None
+    assert constant_axes(chain, (seen,)) is None
 
 
 def test_the_advice_not_to_hold_a_wrong_tool_is_given_once():

@@ -14,7 +14,7 @@ from fits import NOISE, SIGMAS
 from calib_ros import identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision import mistakes, trials
-from calib_ros.decision.mistakes import explained, explained_alone
+from calib_ros.decision.mistakes import diagnose, diagnose_alone
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics import se3
@@ -27,7 +27,7 @@ def test_external_axes_that_come_last_are_named(oriented):
     arm, rng = load_chain('ur10e_on_linear_axis'), np.random.default_rng(1)
     q = arm.random_joints(40, rng)
     seen = measure(faulty(arm, Cell(), rng), q, rng, 5e-5, 2e-4, oriented)
-    found = explained(Problem(arm, replace(seen, joints=np.roll(q, -1, axis=1)))).suspects[0]
+    found = diagnose(Problem(arm, replace(seen, joints=np.roll(q, -1, axis=1)))).suspects[0]
     assert f'in another order, {arm.joint_names[0]} last' in found.what
     assert found.remedy == '--columns q1=q7,q2=q1,q3=q2,q4=q3,q5=q4,q6=q5,q7=q6'
 
@@ -46,7 +46,7 @@ def test_a_coupled_joint_in_a_table_without_units_is_named(length, angle, remedy
     seen = measure(faulty(arm, Cell(), rng), q, rng, 5e-5, oriented=False)
     logged = angle * (q - q[:, [1]] * np.eye(6)[2])
     spoilt = replace(seen, joints=logged, positions=length * seen.positions)
-    (found,) = explained(Problem(arm, spoilt)).suspects
+    (found,) = diagnose(Problem(arm, spoilt)).suspects
     assert found.what == 'several mistakes at once'
     assert f'({remedy})' in found.remedy
     assert found.remedy.endswith('(--columns q3=q3+q2)')
@@ -57,7 +57,7 @@ def test_swapped_ends_of_a_short_arm_are_named_once():
     arm = Chain('short', 'standard', tuple(Joint(f'j{k}', **row) for k, row in enumerate(rows)))
     rng = np.random.default_rng(1)
     seen = measure(faulty(arm, Cell(), rng), rng.uniform(-2.0, 2.0, (40, 3)), rng, 5e-5, 2e-4)
-    (found,) = explained(Problem(arm, replace(seen, joints=seen.joints[:, ::-1]))).suspects
+    (found,) = diagnose(Problem(arm, replace(seen, joints=seen.joints[:, ::-1]))).suspects
     assert found.what == 'j0 and j2 are swapped'
 
 
@@ -66,7 +66,7 @@ def test_messages_from_the_flange_in_millimetres_are_named_with_the_setting_and_
     seen = measure(faulty(arm, Cell(), rng), arm.random_joints(40, rng), rng, 5e-5, 2e-4)
     turned = replace(seen.inverted(), inverse=False)
     wrong = replace(turned, positions=1e3 * turned.positions)
-    said = str(explained(Problem(arm, wrong, of_messages=True)))
+    said = str(diagnose(Problem(arm, wrong, of_messages=True)))
     assert 'set eye_in_hand=true in sources, correct the rest in the publisher' in said
 
 
@@ -77,12 +77,12 @@ def test_rows_that_are_not_like_the_others_are_named():
     one, other = (measure(faulty(arm, Cell(), rng), q, rng, 5e-5, oriented=False) for _ in '12')
     rows = np.arange(50)[:, np.newaxis]
     mixed = replace(one, positions=np.where(rows % 2, one.positions, other.positions))
-    assert explained(Problem(arm, one)) is None
-    found = explained(Problem(arm, mixed))
+    assert diagnose(Problem(arm, one)) is None
+    found = diagnose(Problem(arm, mixed))
     assert str(found).startswith('odd and even rows are of two arms, or of two devices or targets')
     for part, where in ((rows < 22, '1 to 22'), (rows >= 27, '28 to 50')):
         spoilt = replace(one, joints=np.where(part, np.rad2deg(q), q))
-        found = explained(Problem(arm, spoilt))
+        found = diagnose(Problem(arm, spoilt))
         assert found.where == f'in lines {where} alone, '
         assert (
             found.suspects[0].remedy == 'write them as the others (--joint-angle deg reads them)'
@@ -98,7 +98,7 @@ def test_a_few_rows_of_a_camera_on_the_flange_with_other_quaternions_are_named()
     read = se3.from_quat(np.roll(se3.to_quat(given.rotations), 1, axis=1))
     some = np.isin(np.arange(40), [5, 6, 7])[:, np.newaxis, np.newaxis]
     spoilt = replace(given, rotations=np.where(some, read, given.rotations)).inverted()
-    found = str(explained(Problem(arm, spoilt)))
+    found = str(diagnose(Problem(arm, spoilt)))
     assert found.startswith('in lines 6 to 8 alone, the quaternions are w x y z, not x y z w')
 
 
@@ -117,11 +117,11 @@ def test_a_few_rows_in_another_unit_are_named(rows, where, oriented):
         (np.where(some, 1e3 * seen.positions, seen.positions), q, 'positions are in mm'),
         (seen.positions, np.where(some, np.degrees(q), q), 'joint values are in degrees'),
     ):
-        found = str(explained(Problem(arm, replace(seen, positions=positions, joints=joints))))
+        found = str(diagnose(Problem(arm, replace(seen, positions=positions, joints=joints))))
         assert found.startswith(f'in lines {where} alone, the {words}, not ')
         assert ' -- or ' not in found
     many = Problem(arm, replace(seen, joints=np.where(some, np.degrees(q), q)), of_messages=True)
-    told = str(explained_alone(many, true))
+    told = str(diagnose_alone(many, true))
     place = f'in poses {where} of 40 alone'
     assert told.startswith(f'{place}, the joint values are in degrees, not ')
     assert ': correct the publisher and measure again' in told
@@ -150,7 +150,7 @@ def test_rows_of_one_of_several_sets_are_told_with_its_device():
     mixed = np.where(np.arange(40)[:, np.newaxis] < 3, 1e3, 1.0) * there.positions
     second = replace(there, base='second', positions=mixed)
     problem = Problem(arm.with_frame('second', true.frame('second')), first, more=(second,))
-    found = str(explained_alone(problem, true))
+    found = str(diagnose_alone(problem, true))
     assert found.startswith('in the measurements with second alone, in lines 1 to 3 alone')
 
 
@@ -160,7 +160,7 @@ def test_lengths_of_a_wire_are_no_repeated_positions():
     true, q = faulty(arm, Cell(), rng), arm.random_joints(20, rng)
     zeros = Observations.from_arrays(q, np.zeros((20, 3)))
     wire = replace(zeros, distances=np.linalg.norm(true.forward(q)[:, :3, 3], axis=1))
-    assert explained_alone(Problem(arm, wire), true) is None
+    assert diagnose_alone(Problem(arm, wire), true) is None
 
 
 def test_mistakes_of_many_rows_are_searched_in_some_of_them(monkeypatch):
@@ -176,7 +176,7 @@ def test_mistakes_of_many_rows_are_searched_in_some_of_them(monkeypatch):
     seen = measure(true, q, rng, 5e-5, 2e-4)
     late = np.arange(len(q))[:, np.newaxis] >= SOME_POSES
     seen = replace(seen, positions=np.where(late, 1e3, 1.0) * seen.positions)
-    found = str(explained_alone(Problem(arm, seen), true))
+    found = str(diagnose_alone(Problem(arm, seen), true))
     assert found.startswith(f'in lines {SOME_POSES + 1} to {len(q)} alone, the ')
     assert max(tried) <= SOME_POSES
 
@@ -196,7 +196,7 @@ def test_an_arm_is_far_off_by_its_largest_errors_of_position_and_angle(share):
     problem = Problem(arm, replace(seen, joints=seen.joints * [1, 1, -1, 1, 1, 1]))
     half = 0.5 * share * trials.in_frames(problem, arm, problem.sets).error
     limits = {'largest_error': half, 'largest_angle': 3.0 * half / LEVER}
-    assert (explained(replace(problem, **limits), far=True) is None) == (share > 1.0)
+    assert (diagnose(replace(problem, **limits), far=True) is None) == (share > 1.0)
 
 
 @pytest.mark.parametrize(('what', 'largest'), [('rms_mm', 10.0), ('rms_mrad', 20.0)])

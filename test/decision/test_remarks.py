@@ -242,8 +242,8 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
         '_scale': [Reason(Rule.SCALE, found['scale'])] if 'scale' in found else [],
         '_sessions': found.get('sessions', ''),
         '_another_type': found.get('type', ''),
-        '_level': found.get('level', ''),
-        '_elsewhere': found.get('unseen', ''),
+        '_level_hand': found.get('level', ''),
+        '_held_out_excess': found.get('unseen', ''),
         'loose_target': found.get('loose', ''),
         '_motion': found.get('motion', ''),
     }
@@ -253,7 +253,7 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
     monkeypatch.setattr(plausibility, '_lag', lambda _, result: result)
     seen = SimpleNamespace(socket=False, plane=False, pixels=found.get('pixels'))
     given = tuple(Reason(Rule.GAIN, found[name]) for name in ('given',) if name in found)
-    result = plausibility.remarked(
+    result = plausibility.add_remarks(
         SimpleNamespace(sets=[seen], separations=()),
         Judged(given, ('first',), 'coupled' in found),
         another,

@@ -154,4 +154,4 @@ def test_places_are_apart_where_a_plane_explains_nearly_all_of_it(share, apart):
     beside = np.array([1.0, -1.0, -1.0, 1.0] * 2)
     rest = share * EXCEPTION * 6.0 / 7.0
     joints = np.sqrt(1.0 - rest) * (2.0 * after - 1.0) + np.sqrt(rest) * beside
-    assert steps._apart(joints[:, np.newaxis], after) == apart
+    assert steps._separable(joints[:, np.newaxis], after) == apart

@@ -12,13 +12,13 @@ from fits import UR10E, measured_arm
 from calib_ros import Problem, identify
 from calib_ros.decision import mistakes
 from calib_ros.decision.mistakes import (
-    Explained,
-    _by_places,
+    Diagnosis,
+    _beam_search,
+    _best_trials,
     _named,
-    _several,
     _suspicious,
-    _tried,
-    explained,
+    _wrong_rotations,
+    diagnose,
 )
 from calib_ros.decision.undoing import Suspect
 
@@ -26,7 +26,7 @@ FAULTY = SimpleNamespace(largest_error=0.5, largest_length=0.1, largest_angle=0.
 
 
 def test_good_results_are_not_searched(monkeypatch):
-    monkeypatch.setattr(mistakes, 'explained', None)
+    monkeypatch.setattr(mistakes, 'diagnose', None)
     assert identify(Problem(UR10E, measured_arm(1, 40)[2])).accepted
 
 
@@ -76,10 +76,10 @@ def test_few_poses_and_wires_alone_are_not_searched(count, searched, monkeypatch
     tried = []
     monkeypatch.setattr(mistakes, 'in_frames', lambda *_: tried.append(0) or given(error=0.0))
     seen = measured_arm(1, count)[2]
-    assert explained(Problem(UR10E, seen), far=True) is None
+    assert diagnose(Problem(UR10E, seen), far=True) is None
     assert bool(tried) == searched
     wire = replace(seen, distances=np.ones(count), oriented=np.zeros(count, dtype=bool))
-    assert explained(Problem(UR10E, wire)) is None
+    assert diagnose(Problem(UR10E, wire)) is None
     assert bool(tried) == searched
 
 
@@ -97,7 +97,7 @@ def test_positions_are_tried_alone_where_all_poses_are_whole(change, tried, monk
     monkeypatch.setattr(mistakes, 'in_frames', lambda *_: tries.append(0) or given(error=0.0))
     seen = replace(measured_arm(1, 9)[2], **change)
     problem = SimpleNamespace(**vars(FAULTY), sigma_orientation=1e-3)
-    assert (_by_places(problem, UR10E, (seen,), given(), ()) is not None) == tried
+    assert (_wrong_rotations(problem, UR10E, (seen,), given(), ()) is not None) == tried
     assert bool(tries) == tried
 
 
@@ -126,7 +126,7 @@ def searched(monkeypatch):
         monkeypatch.setattr(mistakes, 'in_any_order', lambda *_: ())
         monkeypatch.setattr(mistakes, 'hidden', lambda *_: hidden)
         monkeypatch.setattr(mistakes, 'trial_of', trial_of)
-        monkeypatch.setattr(mistakes, 'refined', lambda problem, trial: trial)
+        monkeypatch.setattr(mistakes, 'refine_trial', lambda problem, trial: trial)
 
     return search
 
@@ -137,7 +137,7 @@ def given(share=1.0, error=1.0):
 
 def named(problem=FAULTY, start=None, **options):
     start = start or given()
-    return _named(problem, start, _tried(problem, UR10E, (), start, **options))
+    return _named(problem, start, _best_trials(problem, UR10E, (), start, **options))
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_what_is_wrong_with_some_rows_is_not_the_arm(searched, monkeypatch):
 
 
 def test_errors_with_and_without_a_mistake_are_told_in_millimetres():
-    told = Explained((Suspect('a', 'undo a'), Suspect('b', 'undo b')), 23.456789, 0.0012)
+    told = Diagnosis((Suspect('a', 'undo a'), Suspect('b', 'undo b')), 23.456789, 0.0012)
     said = 'a: undo a -- or b: undo b'
     assert told.reason.short == said
     off = 'the uncorrected arm is then typically 1.200 mm off, not 23,457 mm'
@@ -205,7 +205,7 @@ MISTAKES = [('a', 1, 'measured'), ('b', 1, 'order'), ('c', 1, 'j1'), ('d', 1, 'j
 )
 def test_mistakes_at_once_are_searched_one_by_one(searched, shares, named):
     searched(MISTAKES, shares)
-    found = _several(FAULTY, UR10E, given())
+    found = _beam_search(FAULTY, UR10E, given())
     assert (found is not None) == bool(named)
     if named:
         (both,) = found.suspects
@@ -216,13 +216,13 @@ def test_mistakes_at_once_are_searched_one_by_one(searched, shares, named):
 
 def test_mistakes_of_one_part_are_not_made_at_once(searched):
     searched([('a', 1, 'order'), ('b', 1, 'order'), ('c', 1, '')], {'ab': 0.1, 'ac': 0.1})
-    assert _several(FAULTY, UR10E, given()) is None
+    assert _beam_search(FAULTY, UR10E, given()) is None
     searched([('a', 1, 'order'), ('b', 1, 'j1')], {'ab': 0.1})
-    assert _several(FAULTY, UR10E, given(error=0.4)) is None  # a faulty arm is no worse
-    assert _several(FAULTY, UR10E, given(error=0.6))
+    assert _beam_search(FAULTY, UR10E, given(error=0.4)) is None  # a faulty arm is no worse
+    assert _beam_search(FAULTY, UR10E, given(error=0.6))
     searched([('a', 1, 'order'), ('b', 1, 'j1')], {'ab': 0.27})
-    assert _several(FAULTY, UR10E, given())
-    assert _several(FAULTY, UR10E, given(error=0.8)) is None  # 0.24 would be much less
+    assert _beam_search(FAULTY, UR10E, given())
+    assert _beam_search(FAULTY, UR10E, given(error=0.8)) is None  # 0.24 would be much less
 
 
 def test_signs_that_hide_each_other_are_tried_together(searched):
@@ -230,9 +230,9 @@ def test_signs_that_hide_each_other_are_tried_together(searched):
     alone = {name: 0.9 + 0.01 * k for k, name in enumerate('abcdef')}
     options = [(name, 1, f'j{name}') for name in 'abcdefgh']
     searched(options, alone | {'gh': 0.1})
-    assert _several(FAULTY, UR10E, given()) is None
+    assert _beam_search(FAULTY, UR10E, given()) is None
     searched(options, alone | {'gh': 0.1}, pairs=['gh'])
-    assert _several(FAULTY, UR10E, given()).suspects[0].remedy == 'g (undo g); h (undo h)'
+    assert _beam_search(FAULTY, UR10E, given()).suspects[0].remedy == 'g (undo g); h (undo h)'
 
 
 @pytest.mark.parametrize('pixels', [None, 1])
@@ -241,4 +241,4 @@ def test_mistakes_at_once_of_images_are_those_of_boards_and_places(pixels, searc
     both = mistakes.suspects()
     monkeypatch.setattr(mistakes, 'suspects', lambda chain, sets, boards: both if boards else [])
     images = SimpleNamespace(**vars(FAULTY) | {'sets': [SimpleNamespace(pixels=pixels)]})
-    assert (_several(images, UR10E, given()) is None) == (pixels is None)
+    assert (_beam_search(images, UR10E, given()) is None) == (pixels is None)

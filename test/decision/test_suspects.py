@@ -105,7 +105,7 @@ def test_mistakes_of_joints_hide_each_other_and_behind_another_hand(rng):
     assert {len(parts) for parts in told} == {2}
     turned, flipped = set(), set()
     for these in (*found[:two], *found[-20:]):
-        (undone,) = reduce(lambda sets, each: each.undone(sets), these, (seen,))
+        (undone,) = reduce(lambda sets, each: each.undo_in(sets), these, (seen,))
         signs = np.diff(undone.joints, axis=0) / np.diff(seen.joints, axis=0)
         np.testing.assert_allclose(np.abs(signs), 1.0)
         zeros = undone.joints[0] - np.sign(signs[0]) * seen.joints[0]
@@ -133,7 +133,7 @@ def test_sign_and_zero_of_a_joint_are_undone(remedy, sign, zero, rng):
     arm = load_chain('ur10e')
     seen = measure(arm, arm.random_joints(5, rng), rng)
     found = [each for each in suspects(arm, (seen,)) if f'--columns {remedy}' in each.remedy]
-    (undone,) = found[0].undone((seen,))
+    (undone,) = found[0].undo_in((seen,))
     wanted = seen.joints.copy()
     wanted[:, 2] = sign * wanted[:, 2] + zero * np.pi
     np.testing.assert_allclose(undone.joints, wanted)
@@ -168,7 +168,7 @@ def test_units_are_undone(what, positions, travel, angles, rng):
         joints=seen.joints * np.array([travel, *[angles] * 6]),
     )
     (found,) = (each for each in suspects(rail, (spoilt,)) if each.what == what)
-    (undone,) = found.undone((spoilt,))
+    (undone,) = found.undo_in((spoilt,))
     np.testing.assert_allclose(undone.positions, seen.positions)
     np.testing.assert_allclose(undone.joints, seen.joints)
 
@@ -222,7 +222,7 @@ def test_ways_to_write_a_pose_are_undone_in_the_poses_as_measured(what, written,
         )
         spoilt, given = (each.inverted() if inverse else each for each in (spoilt, seen))
         (found,) = (each for each in suspects(arm, (spoilt,)) if each.what == what + more)
-        (undone,) = found.undone((spoilt,))
+        (undone,) = found.undo_in((spoilt,))
         for name in ('joints', 'positions', 'rotations'):
             np.testing.assert_allclose(getattr(undone, name), getattr(given, name), atol=1e-9)
 
@@ -263,7 +263,7 @@ def test_what_is_wrong_with_coordinates_is_undone_as_measured(what, matrix, inve
     spoilt = replace(seen, positions=seen.positions @ matrix.T)
     spoilt, given = (each.inverted() if inverse else each for each in (spoilt, seen))
     (found,) = (each for each in suspects(arm, (spoilt,)) if each.what == what)
-    (undone,) = found.undone((spoilt,))
+    (undone,) = found.undo_in((spoilt,))
     np.testing.assert_allclose(undone.positions, given.positions, atol=1e-9)
 
 
@@ -275,7 +275,7 @@ def test_the_size_of_a_board_is_told_as_it_is_stated(size, times, rng):
     found = list(suspects(arm, (stated,), of_images=True))
     (board,) = (each for each in found if each.what.startswith('the board is'))
     assert board.what == f'the board is stated {times} times as large as it is'
-    np.testing.assert_allclose(board.undone((stated,))[0].positions, seen.positions)
+    np.testing.assert_allclose(board.undo_in((stated,))[0].positions, seen.positions)
     camera, *of_prints, joints = found[:4]
     assert camera.published == 'set eye_in_hand=true in sources'
     (back, *_) = suspects(arm, (stated.inverted(),), of_images=True)
@@ -339,7 +339,7 @@ def test_signs_and_zeros_to_set_in_the_chain_file_do_what_the_columns_do(rng):
                 else joint
                 for joint in fanuc.joints
             ]
-            (undone,) = each.undone((seen,))
+            (undone,) = each.undo_in((seen,))
             found = replace(fanuc, joints=tuple(joints)).forward(seen.joints)
             np.testing.assert_allclose(found, fanuc.forward(undone.joints), atol=1e-9)
             checked += 1

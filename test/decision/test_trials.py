@@ -11,7 +11,7 @@ from fits import NOISE, UR10E, measured_arm
 from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.reasons import Rule
-from calib_ros.decision.trials import Trial, fits_each_side, misses, refined, trial_of
+from calib_ros.decision.trials import Trial, fits_each_side, refine_trial, sample_errors, trial_of
 from calib_ros.estimation.start import flange
 
 
@@ -64,8 +64,8 @@ def test_gross_errors_do_not_spoil_the_refinement():
     assert rough.error == pytest.approx(1e-3 * np.sqrt(3.0), abs=1e-8)
     turned = Trial(near.with_offsets({'base.rz': 1e-3}), (seen,), (arm,))
     for trial in (rough, turned):
-        found = refined(Problem(UR10E, seen, sigma_position=NOISE[0]), trial)
-        assert misses(found.chain, seen, arm)[8:].max() < 1e-6
+        found = refine_trial(Problem(UR10E, seen, sigma_position=NOISE[0]), trial)
+        assert sample_errors(found.chain, seen, arm)[8:].max() < 1e-6
 
 
 def test_two_sessions_in_one_are_no_mistakes():

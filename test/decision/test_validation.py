@@ -15,7 +15,7 @@ from calib_ros.decision import validation
 from calib_ros.decision.acceptance import refusals
 from calib_ros.decision.comparison import Comparison, Residuals, compare, log_gain, residuals
 from calib_ros.decision.reasons import Rule
-from calib_ros.decision.validation import left_out
+from calib_ros.decision.validation import fold_residuals
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import minimise
@@ -209,7 +209,7 @@ def test_every_pair_is_judged_by_the_chains_of_its_fold():
         tuple(base.with_offsets({'elbow_joint.a': 1e-3 * (2 * k + side)}) for side in range(2))
         for k in range(3)
     ]
-    before, after = left_out(chains, sets, groups, folds)
+    before, after = fold_residuals(chains, sets, groups, folds)
     for side, found in enumerate((before, after)):
         expected = []
         for each, numbers in zip(sets, folds, strict=True):
@@ -257,7 +257,7 @@ def test_folds_leave_enough_to_fit_and_some_to_spare(count, rows, names, known, 
         informed=frozenset(f'p{k}' for k in range(known)),
     )
     every = [*(f'p{k}' for k in range(names)), 'elbow_joint.ratio']
-    assert validation._folds(problem, every, count, rows) == wanted
+    assert validation._fold_count(problem, every, count, rows) == wanted
 
 
 def test_held_out_pairs_at_fitted_configurations_are_repeated():

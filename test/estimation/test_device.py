@@ -9,7 +9,7 @@ import pytest
 from measured import bent
 
 from calib_ros import Observations, Problem, identify, load_chain
-from calib_ros.estimation.considered import Doubts, bends, doubted_products
+from calib_ros.estimation.considered import Nuisances, bends, nuisance_products
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.samples import Samples
 
@@ -75,7 +75,7 @@ def test_it_turns_nothing():
     names, found = ARM.parameter_names[::3], []
     for own in (None, covariance()):
         system = System((samples(seen(covariance=own)),))
-        found.append(doubted_products(ARM, names, system, Doubts(by_device=True)))
+        found.append(nuisance_products(ARM, names, system, Nuisances(by_device=True)))
     np.testing.assert_allclose(found[0].cross, found[1].cross, atol=1e-6)
     np.testing.assert_allclose(found[0].doubtful, found[1].doubtful, atol=1e-9)
 

@@ -112,9 +112,9 @@ def test_sizes_beside_the_likely_ones_are_weighed_by_evidence_and_by_how_unusual
     found = object.__new__(Evidence)
     found._names = ('length', 'angle', 'drive', 'scale')
     found._typical = np.log([TYPICAL['length'], TYPICAL['angle'], TYPICAL['drive'], 1.0])
-    found._of = lambda tried: 0.3 * (tried - found._typical)[:, 0]
+    found._log_evidence = lambda tried: 0.3 * (tried - found._typical)[:, 0]
     size = np.add(found._typical, [0.5, -0.3, -50.0, 0.0])
-    told = found.near(size, np.array([2.0, 8.0, 1.0, 1.0]))
+    told = found.sigma_points(size, np.array([2.0, 8.0, 1.0, 1.0]))
     assert sum(weight for weight, _ in told) == pytest.approx(1.0)
     for k, step in ((0, 1.0), (1, 0.5)):
         (more, up), (less, down) = told[2 * k : 2 * k + 2]
@@ -136,7 +136,7 @@ def test_a_rival_is_of_the_size_that_the_data_tell(scale):
         Evidence(matrix, matrix @ mean, np.zeros(5), groups, typical | {'scale': size})
         for size in (1e-2, 0.25)
     )
-    odds, _, covariance = other.against(usual, usual.most_probable(set())[0], set())
+    odds, _, covariance = other.odds_against(usual, usual.most_probable(set())[0], set())
     assert odds > 1.0 if scale > 1.0 else odds < 1.0
     assert covariance[0, 0] == pytest.approx(1.0)  # without a prior
     size = (1.0 / covariance[4, 4] - 1e6) ** -0.5
@@ -152,7 +152,7 @@ def test_a_prior_tells_a_rival_as_much_as_a_measurement_of_zero():
             Evidence(whole, vector, np.diag(given), [None, 'length', 'scale'], sizes)
             for sizes in ({'length': 1.0, 'scale': 0.1}, {'length': 1.0, 'scale': 4.0})
         )
-        odds.append(other.against(usual, usual.most_probable(set())[0], set())[0])
+        odds.append(other.odds_against(usual, usual.most_probable(set())[0], set())[0])
     assert odds[0] == pytest.approx(odds[1])
 
 
@@ -216,8 +216,8 @@ def test_the_expected_error_is_that_of_shift_and_covariance(rng):
     square = found.covariance + np.outer(found.shift, found.shift)
     expected = np.einsum('nip,pq,njq->nij', rows, square, rows)
     np.testing.assert_allclose(found.expected(q), expected, rtol=0, atol=1e-6)
-    assert found.held('base.x') == 0.0
-    assert found.held('elbow_joint.theta') == pytest.approx(found.covariance[2, 2] / 0.25)
+    assert found.prior_share('base.x') == 0.0
+    assert found.prior_share('elbow_joint.theta') == pytest.approx(found.covariance[2, 2] / 0.25)
 
 
 def test_a_fit_is_weighed_with_the_likeliest_sizes_alone():
@@ -265,11 +265,11 @@ def test_only_what_is_fitted_is_doubted(monkeypatch):
     class AskedError(Exception):
         pass
 
-    def doubted_products(chain, names, system, doubts, noise):
-        assert (noise, doubts.sizes) == (2.0, {'elbow_joint.theta': 1e-3})
+    def some_products(chain, names, system, nuisances, noise):
+        assert (noise, nuisances.sizes) == (2.0, {'elbow_joint.theta': 1e-3})
         raise AskedError
 
-    monkeypatch.setattr(evidence, 'doubted_products', doubted_products)
+    monkeypatch.setattr(evidence, 'nuisance_products', some_products)
     rounding = {'elbow_joint.theta': 1e-3, 'wrist_1_joint.theta': 2e-3}
     problem = SimpleNamespace(model=UR10E, given={}, sigma_scale=0.0)
     names = ('base.x', 'elbow_joint.theta')

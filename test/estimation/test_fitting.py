@@ -12,7 +12,7 @@ from fits import NOISE, SIGMAS, UR10E, arm, measured_arm, rms
 from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation import fitting
-from calib_ros.estimation.fitted import Simpler, _to_values, parameter_rows
+from calib_ros.estimation.fitted import SimplerFit, _value_jacobian, parameter_rows
 from calib_ros.estimation.fitting import SOME
 from calib_ros.estimation.identifiability import Uncertainty
 from calib_ros.estimation.noise import Noise
@@ -69,7 +69,7 @@ def test_only_what_is_told_worse_than_common_sense_is_guarded():
     )
     good = np.eye(5) / np.array([1.0, 0.9 * length, 0.9 * angle, 1.0, 0.9 * length])
     assert fitting._guarded(problem, names, good, None) is problem
-    simpler = Simpler(UR10E, (), noise(4.0))
+    simpler = SimplerFit(UR10E, (), noise(4.0))
     assert fitting._guarded(problem, names, good, simpler).learned == Learned({}, 2.0)
     learned = replace(problem, learned=Learned({'base.x': 7.0}, 3.0))
     again = fitting._guarded(learned, names, np.diag(1.0 / stds), None).learned
@@ -101,13 +101,13 @@ def test_of_many_pairs_some_tell_the_priors_of_a_richer_model(count, share):
     first = seen(5).select(np.arange(count - SOME) % 5)
     second = replace(first.select(np.arange(SOME) % 5), base='base_B')
     problem = Problem(UR10E, first, more=(second,))
-    simpler = Simpler(UR10E, (np.arange(count - SOME), np.arange(SOME)), noise(1.0))
-    few, told = fitting._some(problem, simpler)
+    simpler = SimplerFit(UR10E, (np.arange(count - SOME), np.arange(SOME)), noise(1.0))
+    few, told = fitting._thin_problem(problem, simpler)
     assert [len(each) for each in few.sets] == [-(-len(each) // share) for each in problem.sets]
     for distances, given in zip(told.distances, simpler.distances, strict=True):
         np.testing.assert_array_equal(distances, given[::share])
     np.testing.assert_array_equal(few.sets[0].joints, first.joints[::share])
-    assert fitting._some(problem, None) == (problem, None)
+    assert fitting._thin_problem(problem, None) == (problem, None)
 
 
 def test_turns_of_frames_become_rotation_vectors():
@@ -125,9 +125,9 @@ def test_turns_of_frames_become_rotation_vectors():
             for step in (-1e-6, 1e-6)
         ]
         expected[order, k] = (ends[1] - ends[0]) / 2e-6
-    np.testing.assert_allclose(_to_values(chain, names), expected, atol=1e-8)
+    np.testing.assert_allclose(_value_jacobian(chain, names), expected, atol=1e-8)
     some = [0, 2, 3, 5]
-    found = _to_values(chain, [names[k] for k in some])
+    found = _value_jacobian(chain, [names[k] for k in some])
     np.testing.assert_allclose(found, expected[np.ix_(some, some)], atol=1e-8)
 
 

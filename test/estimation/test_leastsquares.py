@@ -18,10 +18,10 @@ from calib_ros.estimation.leastsquares import (
     Normal,
     Prior,
     System,
+    leave_fold_out,
     minimise,
     normal_equations,
     triangular_factor,
-    without_each,
 )
 from calib_ros.estimation.samples import BLOCK, Samples
 from calib_ros.estimation.start import start_frames
@@ -207,7 +207,7 @@ def test_a_fold_left_out_is_a_fit_to_the_others():
         parts = [seen.select(np.arange(14)), seen.select(np.arange(14, 24))]
         system = System(tuple(Samples(each, 1e-4, 3e-4) for each in parts), prior)
         start = minimise(true, names, system).chain
-        found = list(without_each(start, names, system, folds))
+        found = list(leave_fold_out(start, names, system, folds))
         assert len(found) == 3
         for k, chain in enumerate(found):
             alone = minimise(start, names, system.select([each != k for each in folds])).chain
@@ -254,5 +254,7 @@ def test_a_fit_knows_how_long_its_next_step_would_be(seed):
     names = structurally_independent(problem.model, problem.free, problem.kinds)
     system = problem.system(problem.sets)
     found = minimise(start_frames(problem), names, system, tolerance=1e-2)
-    assert found.left < 0.1 * 1e-2
-    assert minimise(found.chain, names, system, tolerance=np.inf).left < found.left
+    assert found.next_step_rms < 0.1 * 1e-2
+    assert (
+        minimise(found.chain, names, system, tolerance=np.inf).next_step_rms < found.next_step_rms
+    )

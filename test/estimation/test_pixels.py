@@ -14,7 +14,7 @@ from measured import rows_of, write_csv, write_images
 
 from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
-from calib_ros.decision.mistakes import explained
+from calib_ros.decision.mistakes import diagnose
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.leastsquares import System, products_of, stacked
 from calib_ros.estimation.pixels import PixelSamples
@@ -302,7 +302,7 @@ MISTAKES = {
 @pytest.mark.parametrize('on_flange', [True, False])
 def test_where_nothing_is_wrong_nothing_is_said(on_flange):
     _, seen = scene(2, on_flange, 20)
-    assert explained(Problem(known(on_flange), seen, sigma_pixel=SIGMA)) is None
+    assert diagnose(Problem(known(on_flange), seen, sigma_pixel=SIGMA)) is None
 
 
 @pytest.mark.parametrize(
@@ -315,7 +315,7 @@ def test_the_usual_mistakes_are_named(kind, on_flange):
     wrong = replace(seen, **change(seen))
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        found = explained(Problem(known(wrong.on_flange), wrong, sigma_pixel=SIGMA))
+        found = diagnose(Problem(known(wrong.on_flange), wrong, sigma_pixel=SIGMA))
     assert words in str(found)
     if kind in ('board', 'mirrored'):
         assert all(each.published == each.remedy for each in found.suspects)
@@ -323,7 +323,7 @@ def test_the_usual_mistakes_are_named(kind, on_flange):
         assert ('leave out' in str(found)) == wrong.on_flange
         live = Problem(known(wrong.on_flange), wrong, sigma_pixel=SIGMA, of_messages=True)
         value = 'false' if wrong.on_flange else 'true'
-        assert f'set eye_in_hand={value} in sources' in str(explained(live))
+        assert f'set eye_in_hand={value} in sources' in str(diagnose(live))
 
 
 def test_the_mistake_comes_first_where_the_fit_does_not_end_well():

@@ -126,7 +126,7 @@ def test_a_robust_fit_starts_from_least_absolute_lengths(loss, monkeypatch):
     found = robust.robust_fit(far, names, system, loss)
     assert found.settled
     size = max(1.0, found.fit.normal.rms(found.system))
-    assert found.fit.left < robust.STEP_TOLERANCE * size
+    assert found.fit.next_step_rms < robust.STEP_TOLERANCE * size
     (last,) = distances_of(starts[0], names, system)
     bounded = system.weighted([1.0 / np.maximum(last, 1.0)])
     (again,) = distances_of(minimise(starts[0], names, bounded).chain, names, system)

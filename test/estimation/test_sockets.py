@@ -15,7 +15,7 @@ from calib_ros import Chain, Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.estimation.considered import Doubts, doubted_products
+from calib_ros.estimation.considered import Nuisances, nuisance_products
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.start import start_frames
 from calib_ros.kinematics import se3
@@ -64,7 +64,7 @@ def test_a_ball_on_the_last_axis_leaves_it_near_nominal(offset):
     assert result.accepted
     angle = result.posterior.sizes['angle']
     for name in ('joint_6.alpha', 'joint_6.theta'):  # sigma by the poses alone: some mrad
-        assert result.posterior.held(name) > 0.5
+        assert result.posterior.prior_share(name) > 0.5
         assert abs(result.chain.offset(name, IIWA)) < 3.0 * angle
     assert {'joint_6.alpha', 'joint_6.theta'} <= set(result.weak)
     assert ', '.join(result.weak) in summary(result)
@@ -161,7 +161,9 @@ def test_known_distances_count_once_however_the_touches_are_thinned():
     system = problem.system(sets)
     chain = start_frames(problem)
     every, few = (
-        doubted_products(chain, problem.free, system, Doubts(), most=system.count // share).plain
+        nuisance_products(
+            chain, problem.free, system, Nuisances(), most=system.count // share
+        ).plain
         for share in (1, 4)
     )
     np.testing.assert_allclose(few, every, rtol=1e-9, atol=1e-9 * np.abs(every).max())

@@ -11,7 +11,7 @@ from scipy import special
 
 from calib_ros import Chain, Observations, Problem, identify, load_chain, read_table
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.decision.plausibility import _apart
+from calib_ros.decision.plausibility import _arm_distance
 from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation import start
@@ -121,7 +121,7 @@ def test_the_size_that_planes_do_not_tell_is_as_uncertain_as_lengths_are(seed):
     assert result.accepted, result.refusals
     assert UR.joint_names[1] + '.a' in result.unidentifiable  # the longest of its lengths
     q = true.random_joints(200, np.random.default_rng(0))
-    before, after = (_apart(chain, true, q) for chain in (UR, result.chain))
+    before, after = (_arm_distance(chain, true, q) for chain in (UR, result.chain))
     assert after < 0.6 * before
     assert after < 2.0 * np.median(result.region.known(q))
 

@@ -14,7 +14,7 @@ from calib_ros import Problem, Settings, identify, load_chain
 from calib_ros.apply import simulation
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.history import History
-from calib_ros.files.rows import Filing, Row, identified, samples_hash, settings_hash
+from calib_ros.files.rows import Filing, Row, result_row, samples_hash, settings_hash
 
 CHAIN = load_chain('ur10e')
 BEGIN = datetime(2026, 1, 31, 23, 30, 0, 123_456, timezone.utc)
@@ -35,7 +35,7 @@ def row(k=0, serial='SN 1/ö', **more):
 
 def test_a_row_comes_back_as_it_was_filed(result, tmp_path):
     settings = settings_hash(CHAIN, Settings())
-    filed = identified(result, Filing('0042', BEGIN, 'i' * 64, settings, 'a.csv', 'f'))
+    filed = result_row(result, Filing('0042', BEGIN, 'i' * 64, settings, 'a.csv', 'f'))
     store = History(tmp_path / 'history')
     assert store.file(filed)
     assert store.serials() == ('0042',)

@@ -12,7 +12,7 @@ import pytest
 
 from calib_ros.apply import simulation
 from calib_ros.estimation.problem import Problem
-from calib_ros.files.rows import Filing, identified
+from calib_ros.files.rows import Filing, result_row
 from calib_ros.fleet.watch import watch
 from calib_ros.identification.age import drift_of
 from calib_ros.identification.identification import identify
@@ -34,7 +34,7 @@ def first():
     poses = simulation.measure(true, true.random_joints(60, rng), rng, *plants.SIGMAS)
     sigmas = dict(zip(('sigma_position', 'sigma_orientation'), plants.SIGMAS, strict=True))
     result = identify(Problem(load_chain('ur10e'), poses, **sigmas))
-    return identified(result, Filing('A', plants.when(0), '', ''))
+    return result_row(result, Filing('A', plants.when(0), '', ''))
 
 
 def nights(first, rng, count, bump=(99, ''), scatter=1.0):

@@ -11,7 +11,7 @@ from fits import NOISE, SCARA, SIGMAS, UR10E, problem, rms
 from calib_ros import Calibration, Problem, difference, identify, recalibrate
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.changes import reason_in_words
-from calib_ros.decision.mistakes import explained
+from calib_ros.decision.mistakes import diagnose
 from calib_ros.errors import InputError
 from calib_ros.identification.recalibrated import ANEW
 from calib_ros.kinematics.chain import Chain, Joint
@@ -81,7 +81,7 @@ def test_a_zero_that_is_off_by_a_turn_of_the_motor_is_the_only_change(
 def test_a_turn_of_the_motor_is_no_mistake_of_the_table(earlier):
     true, _, oriented = earlier
     now = true.with_offsets({'shoulder_lift_joint.theta': np.radians(7.2)})
-    assert explained(problem(now, 8, 1, oriented), far=True) is None
+    assert diagnose(problem(now, 8, 1, oriented), far=True) is None
 
 
 def test_a_slipped_zero_of_the_last_joint_is_told_by_positions(earlier):

@@ -16,7 +16,7 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
-from calib_ros.kinematics.effects import basis, led
+from calib_ros.kinematics.effects import basis, couple_held
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.joint import Joint
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
@@ -79,7 +79,7 @@ def test_a_led_joint_may_lead_another(order):
     chain = Chain('arm', 'standard', (Joint('a'), *held), effects=given)
     expected = np.array([[0.5], [-0.5], [0.5], [-0.5]])
     reported = np.array([[0.5], [0.1], [0.2], [0.3]])
-    np.testing.assert_allclose(led(chain, reported), expected, atol=1e-12)
+    np.testing.assert_allclose(couple_held(chain, reported), expected, atol=1e-12)
     np.testing.assert_allclose(chain.effective(reported), expected, atol=1e-12)
 
 

@@ -15,9 +15,9 @@ from scipy.linalg import block_diag
 from calib_ros import Calibration, Observations, Problem, difference, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.changes import (
-    Effects,
+    ChangeColumns,
     Information,
-    gauged,
+    gauge_map,
     reason_in_words,
     reasons_of,
 )
@@ -190,7 +190,7 @@ def test_what_a_parameter_shares_with_others_is_a_share():
     """Axes of shoulder and elbow are parallel: the one's d is as good as the other's."""
     names = [Parameter('elbow_joint.d'), Parameter('elbow_joint.theta')]
     others = [Parameter('shoulder_lift_joint.d'), *names, Parameter('wrist_1_joint.a')]
-    taken, left = gauged(UR, names, others, free=False)
+    taken, left = gauge_map(UR, names, others, free=False)
     np.testing.assert_allclose(taken[:, :3], [[1, 1, 0], [0, 0, 1]], atol=1e-9)
     np.testing.assert_allclose(left[:3], 0.0, atol=1e-9)
     assert 0.1 < left[3] < 1.0
@@ -200,7 +200,7 @@ def test_reasons_of_one_effect_are_told_together():
     names = (Parameter('elbow_joint.theta'), Parameter('wrist_1_joint.theta'))
     matrix = np.full((2, 2), 1e10)
     information = Information(names, matrix, matrix @ (1e-3, 0.0))
-    told = reason_in_words(reasons_of(information, Effects(UR, names), 100.0))
+    told = reason_in_words(reasons_of(information, ChangeColumns(UR, names), 100.0))
     alike = [f'{name} by +1.000 ± 0.020 mrad (95 %)' for name in names]
     assert told == f'changed: {", indistinguishable from ".join(alike)}'
 
@@ -211,7 +211,7 @@ def test_what_moves_nothing_takes_no_share(nights):
     still = Parameter('wrist_3_joint.gravity_wrist_3_joint')
     chain = first.chain.with_effects([still])
     others = [Parameter('wrist_1_joint.theta'), Parameter('wrist_1_joint.beta')]
-    taken, _ = gauged(chain, [*map(Parameter, first.names), still], others, free=False)
+    taken, _ = gauge_map(chain, [*map(Parameter, first.names), still], others, free=False)
     np.testing.assert_allclose(taken[-1], 0.0, atol=1e-9)
 
 

@@ -12,7 +12,7 @@ from fits import UR10E, measured_arm
 
 from calib_ros.decision.comparison import GroupVerdict, log_gain
 from calib_ros.decision.drift import Shifts
-from calib_ros.estimation.leastsquares import owners, stacked
+from calib_ros.estimation.leastsquares import row_samples, stacked
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.identification import linear_model
 from calib_ros.identification.linear_model import LinearModel
@@ -82,7 +82,7 @@ def left_out(told, sets, dealing, names, sizes, noise=NOISE):
     system = told.system(sets)
     chain = told.model.with_effects([n for n in names if n not in NAMES])
     rows = system.rows_of(chain, names)
-    whole, owner = stacked(rows), owners(rows)
+    whole, owner = stacked(rows), row_samples(rows)
     fold = groups_of(sets)[1][dealing][owner]
     prior = np.diag([noise / sizes[n] if n in sizes else 0.0 for n in names])
     left = np.zeros(len(whole))
@@ -106,18 +106,18 @@ def test_what_is_left_out_is_predicted_by_fits_to_the_rest(model):
         for chosen in ((), FIRST, (*FIRST, *SECOND), (*SECOND, *FIRST)):
             sizes = prior | {name: usual[name] for name in chosen}
             expected = left_out(told, sets, dealing, [*NAMES, *chosen], sizes)
-            found = linear._left_out(dealing, chosen)
+            found = linear._held_out_errors(dealing, chosen)
             np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
 def test_what_is_left_with_chosen_effects_is_the_noise_from_then_on(model):
     """Priors of the arm and of effects are weighed against it."""
     told, sets, linear = model
-    linear._left_out(0, FIRST)
-    linear.quieten(GroupVerdict('', 1.0, 0.25, True))
+    linear._held_out_errors(0, FIRST)
+    linear.shrink_noise(GroupVerdict('', 1.0, 0.25, True))
     sizes = {'elbow_joint.a': 3e-5, **dict.fromkeys(FIRST, 5e-4)}
     expected = left_out(told, sets, 0, [*NAMES, *FIRST], sizes, NOISE / 4.0)
-    np.testing.assert_allclose(linear._left_out(0, FIRST), expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(linear._held_out_errors(0, FIRST), expected, rtol=0, atol=1e-9)
 
 
 def test_verdicts_are_of_the_errors_left_out(model, monkeypatch):
@@ -125,7 +125,8 @@ def test_verdicts_are_of_the_errors_left_out(model, monkeypatch):
     _, sets, linear = model
     verdict = linear.judge(['wrist_2_joint.sin_1'], [*FIRST, 'wrist_2_joint.sin_1'], 'waves')
     before, after = (
-        [linear._left_out(k, ['wrist_2_joint.sin_1', *new]) for k in (0, 1)] for new in ((), FIRST)
+        [linear._held_out_errors(k, ['wrist_2_joint.sin_1', *new]) for k in (0, 1)]
+        for new in ((), FIRST)
     )
     for found, errors in ((verdict.rms_mm_before, before), (verdict.rms_mm_after, after)):
         assert found == pytest.approx(1e3 * np.sqrt((errors[0] ** 2).sum() / len(errors[0])))

@@ -235,7 +235,7 @@ class Told:
             gain = 0.75
         return GroupVerdict(what, 1.0, 1.0 - gain, gain > 0.0)
 
-    def quieten(self, verdict):
+    def shrink_noise(self, verdict):
         self.noise *= verdict.rms_mm_after
 
     def strongest_harmonic(self, chosen, progress):
@@ -284,7 +284,7 @@ def choice(monkeypatch):
 
     def chosen(model):
         monkeypatch.setattr(identification, 'LinearModel', lambda *_: model)
-        found = identification._chosen(SimpleNamespace(chain=UR10E), None, lambda _: None)
+        found = identification._choose_effects(SimpleNamespace(chain=UR10E), None, lambda _: None)
         return found[0], {verdict.what: verdict.pays for verdict in found[1]}
 
     return chosen
@@ -371,9 +371,9 @@ def test_a_richer_model_is_used_unless_it_is_worse(before, richer, reason, monke
         return ('elbow_joint.ratio',), verdicts
 
     monkeypatch.setattr(identification, 'identify', identified)
-    monkeypatch.setattr(identification, '_chosen', lambda *_: ((), verdicts))
+    monkeypatch.setattr(identification, '_choose_effects', lambda *_: ((), verdicts))
     assert identify_model(problem, 'auto') == replace(before, verdicts=verdicts)
-    monkeypatch.setattr(identification, '_chosen', chosen)
+    monkeypatch.setattr(identification, '_choose_effects', chosen)
     found = identify_model(problem, 'auto', lambda told: shares.append(told))
     assert found.richer is (reason is None)
     assert found.verdicts == verdicts

@@ -9,7 +9,7 @@ import pytest
 from fits import UR10E, problem
 
 from calib_ros import Calibration, identify, recalibrate
-from calib_ros.decision.changes import FALSE, LOAD, SCALE_OF_DEVICE
+from calib_ros.decision.changes import FALSE_ALARM, LOAD, SCALE_OF_DEVICE
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.settings import Settings
 
@@ -38,7 +38,7 @@ def result(before=0.1, after=0.1, owners=(), **change):
         ({'before': 0.4, 'after': 0.49}, True),
         ({'before': 0.4, 'after': 0.51}, False),  # five times what is usual
         ({'before': LIMIT, 'after': 1.01 * LIMIT, 'fitted_mm': LIMIT}, False),
-        ({'unexplained': FALSE}, False),
+        ({'unexplained': FALSE_ALARM}, False),
         ({'reused': 0.1}, False),
         ({'owners': ['elbow_joint'], 'before': 0.2}, True),
         ({'owners': ['elbow_joint']}, False),  # which changed nothing
@@ -54,7 +54,7 @@ def test_new_poses_agree_by_themselves_and_tell_enough(change, accepted):
 
 
 def test_a_frame_may_have_moved_far_where_errors_are_large():
-    far = {'before': 1.01 * LIMIT, 'unexplained': FALSE}
+    far = {'before': 1.01 * LIMIT, 'unexplained': FALSE_ALARM}
     assert result(**far).perhaps_moved
     assert result(1.01 * LIMIT, owners=['elbow_joint', 'base']).perhaps_moved
     for change in ({'before': 0.99 * LIMIT}, {'reused': 0.1}, {'unexplained': 0.5}):

@@ -11,8 +11,14 @@ from fits import NOISE, SIGMAS, UR10E
 from calib_ros import Calibration, Problem, difference, identify, load_chain, recalibrate
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.errors import ConfigError
-from calib_ros.estimation.considered import Doubts, doubted_products
-from calib_ros.estimation.joint_errors import NOTHING, Unmodelled, moved, moving, waved
+from calib_ros.estimation.considered import Nuisances, nuisance_products
+from calib_ros.estimation.joint_errors import (
+    NOTHING,
+    Unmodelled,
+    axis_parameters,
+    turns_and_tilts,
+    wobble_columns,
+)
 from calib_ros.identification.calibration import parse_calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -111,9 +117,9 @@ def test_what_a_sound_arm_wobbles_in_a_small_region_is_corrected_only_there(seed
 def test_waves_kept_as_parameters_and_then_left_out_are_what_waves_in_doubt_are():
     problem = Wobbling(0).measured(np.zeros(6), 20)
     system, names = problem.system(problem.sets), ('base.x', 'elbow_joint.a', 'elbow_joint.beta')
-    doubts = Doubts(lengths={'elbow_joint.a': 0.5}, unmodelled=Unmodelled(waves=1e-4))
-    without = doubted_products(UR10E, names, system, doubts)
-    kept = doubted_products(UR10E, names, system, replace(doubts, kept=True))
+    doubts = Nuisances(lengths={'elbow_joint.a': 0.5}, unmodelled=Unmodelled(waves=1e-4))
+    without = nuisance_products(UR10E, names, system, doubts)
+    kept = nuisance_products(UR10E, names, system, replace(doubts, kept=True))
     assert without.doubtful.shape == kept.plain[3:-2, 3:-2].shape == (48, 48)
     assert kept.doubtful.shape == (0, 0)
     others = [0, 1, 2, -2, -1]  # the scale and the residual last
@@ -191,9 +197,11 @@ def test_columns_are_those_of_axes_that_tilt(name):
     rng = np.random.default_rng(0)
     chain = faulty(chain, Cell(), rng)
     q = chain.random_joints(5, rng)
-    names = list(dict.fromkeys([*chain.parameter_names, *moving(chain)]))
+    names = list(dict.fromkeys([*chain.parameter_names, *axis_parameters(chain)]))
     rows = np.moveaxis(ErrorModel(chain, names).jacobian(q), 2, 0).transpose(0, 2, 1)
-    found = waved(moved(chain, names, rows)[1], q).reshape(len(chain.joints), 2, 4, 6, len(q))
+    found = wobble_columns(turns_and_tilts(chain, names, rows)[1], q).reshape(
+        len(chain.joints), 2, 4, 6, len(q)
+    )
     waves = [np.cos(q.T), np.cos(2.0 * q.T), np.sin(q.T), np.sin(2.0 * q.T)]
     axes = [ErrorModel(chain, [joint.driven]).jacobian(q)[:, 3:, 0] for joint in chain.joints]
     for joint, (own, axis) in enumerate(zip(found, axes, strict=True)):

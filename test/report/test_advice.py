@@ -11,7 +11,7 @@ from pages import page_of, report_of
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply import simulation
-from calib_ros.decision.mistakes import Explained
+from calib_ros.decision.mistakes import Diagnosis
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.undoing import Suspect
 from calib_ros.report import advice
@@ -31,7 +31,7 @@ def test_every_refusal_is_told_in_plain_words(rule, auto):
 
 def test_a_verdict_names_each_of_several_mistakes():
     both = Suspect('several mistakes at once', 'a, b are swapped (--columns a); c counts (sign)')
-    found = Explained((both,), 1.0, 2e-3)
+    found = Diagnosis((both,), 1.0, 2e-3)
     (told,) = advice.advice([found.reason])
     assert told.in_short.endswith(f': {both.what}: {both.remedy}')
 

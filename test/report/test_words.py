@@ -14,7 +14,7 @@ from calib_ros.apply.verification import verify
 from calib_ros.decision.comparison import Comparison, Residuals
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.noise import Noise
-from calib_ros.files.rows import Filing, verified
+from calib_ros.files.rows import Filing, verification_row
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibrated import Recalibration
@@ -23,7 +23,7 @@ from calib_ros.report import words
 from calib_ros.report.advice import FAR, SPREAD_OUT
 from calib_ros.report.reports import CLOSER, may_be_closer
 from calib_ros.report.verdicts import standing
-from calib_ros.report.words import between, still_holds, verdict
+from calib_ros.report.words import rms_range_mm, still_holds, verdict
 from calib_ros.shown import rounded, sentence
 
 
@@ -86,7 +86,7 @@ def test_what_holds_no_more_is_filed_as_that(bumped, verdict):
     seen = measure(arm, arm.random_joints(10, rng), rng, 5e-5, 2e-4)
     seen.positions[:] += bumped
     found = verify(Calibration(arm, arm, residual=1e-4), [seen], None)
-    row = verified(arm, found, Filing('7', datetime.now(timezone.utc), 'i', 's'))
+    row = verification_row(arm, found, Filing('7', datetime.now(timezone.utc), 'i', 's'))
     assert (row.verdict, row.accepted) == (verdict, False)
     assert ('no longer holds' in standing(found)[0].heading) == (verdict == 'does not hold')
 
@@ -121,10 +121,10 @@ def test_the_error_told_is_the_one_within_its_limits():
     said = 'over poses like these is '
     assert f'{said}{1e3 * found.rms:.3f} mm' in in_words(found)
     filing = Filing('7', datetime.now(timezone.utc), 'i', 's')
-    row = verified(arm, found, filing)
+    row = verification_row(arm, found, filing)
     assert (row.rms_mm, row.rms_freedom) == pytest.approx((1e3 * found.rms, found.freedom))
     fitted = replace(found, reused=0.1)  # no night of a chart
-    assert verified(arm, fitted, filing).rms_freedom is None
+    assert verification_row(arm, fitted, filing).rms_freedom is None
     report = verification_page(arm, [seen], found)
     assert f'each counted once, is {1e3 * found.rms:.3f} mm' in report.verdict.text[0]
     assert any('refitted' in each for each in report.verdict.text)
@@ -236,7 +236,7 @@ def test_no_figure_is_rounded_to_nothing():
 )
 def test_the_limits_of_an_interval_have_the_same_decimals(monkeypatch, limits, said):
     monkeypatch.setattr(words, 'limits_mm', lambda *_: limits)
-    assert between(None, 0) == said
+    assert rms_range_mm(None, 0) == said
 
 
 @pytest.mark.parametrize(
@@ -268,6 +268,6 @@ def test_what_computing_leaves_of_poses_without_noise_is_no_distance():
     position[0, 1:] = 0.0
     after = replace(result.fitted.after, position=position)
     of_poses = replace(result, fitted=replace(result.fitted, after=after))
-    assert words.in_part(of_poses) == ''
+    assert words.error_meaning(of_poses) == ''
     position[0, 0] = 1e-4
-    assert 'errors of distances' in words.in_part(of_poses)
+    assert 'errors of distances' in words.error_meaning(of_poses)

@@ -208,30 +208,30 @@ def test_what_is_lost_while_the_process_stands_still_is_counted(tmp_path, record
 
 
 def test_a_large_share_is_told_as_lost_as_long_as_more_is():
-    heard = inputs_module.Hearing(count=80)
+    heard = inputs_module.TopicState(count=80)
     heard.note_lost(20)
     heard.look(1.0, 1.0)
-    assert heard.gone == 0.2
+    assert heard.share_lost == 0.2
     inputs = object.__new__(inputs_module.Inputs)
     inputs._topics, inputs.failures = {'/joint_states': heard}, []
     assert not inputs.troubles()  # it is among the failures
     heard.count = 200
     heard.look(2.0, 1.0)
-    assert heard.gone == 0.0
+    assert heard.share_lost == 0.0
     heard.note_lost(21)  # of so many that it is an exception
     heard.look(3.0, 1.0)
-    assert heard.gone == 0.0
+    assert heard.share_lost == 0.0
     assert inputs.troubles() == ['messages are lost on /joint_states']
 
 
 def test_what_dds_tells_of_losses_never_goes_below_zero():
     """A total of -2147483645 came as 18446744071562067971 once."""
-    heard = inputs_module.Hearing()
+    heard = inputs_module.TopicState()
     totals = 3, 2**64 - 2147483645, 2**64 - 2147483640, 5, 9, 9
     for total, lost in zip(totals, (3, 3, 8, 8, 12, 12), strict=True):
         heard.note_lost(total)
         assert heard.lost == lost
-    heard = inputs_module.Hearing()  # which goes on where it overflows
+    heard = inputs_module.TopicState()  # which goes on where it overflows
     for total in (2**29, 2**30, 3 * 2**29, 2**31 - 1, 2**64 - 2**31, 2**64 - 2**31 + 2):
         heard.note_lost(total)
     assert heard.lost == 2**31 + 2

@@ -20,7 +20,7 @@ from tf2_msgs.msg import TFMessage
 from calib_ros.errors import ConfigError
 from calib_ros.kinematics import se3
 from calib_ros.ros import inputs as inputs_module
-from calib_ros.ros.inputs import Hearing
+from calib_ros.ros.inputs import TopicState
 
 SOURCE = '/tf parent=tracker child=tool'
 TRACKER = se3.transform(se3.exp_rotation(np.array([0.3, -0.2, 1.0])), np.array([2.0, 1.0, 0.5]))
@@ -97,7 +97,7 @@ def test_without_the_messages_it_is_said_what_to_install(tmp_path, monkeypatch):
 @pytest.mark.parametrize(('latched', 'every'), [(False, 0.1), (True, 0.1), (False, 2.0)])
 def test_frames_that_stand_still_and_single_shots_may_be_silent(monkeypatch, latched, every):
     monkeypatch.setattr(inputs_module, 'SILENCE', 5.0)
-    hearing = Hearing(latched=latched)
+    hearing = TopicState(latched=latched)
     for now in (-100.0, -100.0 + 5.0 * every):
         hearing.count += 1
         hearing.look(now, 1.0)

@@ -20,7 +20,7 @@ POSE_KEY = StreamKey('', '', False, False, False)
 def through(messages, far=1.0):
     """Return what passes of messages (kind, time [s]), in its order, and the gate."""
     gate = Gate(far)
-    return [m for found, _ in gate.through(sliced(messages)) for m in back(found, messages)], gate
+    return [m for found, _ in gate.admit(sliced(messages)) for m in back(found, messages)], gate
 
 
 def sliced(messages):
@@ -132,7 +132,7 @@ def test_slices_pass_as_single_messages_do(messages, size):
 def passing(gate, messages):
     return [
         (each.kind, int(each.stamps[0]))
-        for found, _ in gate.through(sliced(messages))
+        for found, _ in gate.admit(sliced(messages))
         for k in range(len(found))
         for each in found.between(k, k + 1).pieces
     ]

@@ -5,7 +5,7 @@ import pytest
 
 from calib_ros.estimation.configurations import SCATTER
 from calib_ros.sampling.slices import NO_ACCIDENT
-from calib_ros.sampling.stops import SAMPLED, SPIKE, Known, Rests, Schedule, seen_stops
+from calib_ros.sampling.stops import SAMPLED, SPIKE, Rests, SampledStops, Schedule, seen_stops
 from calib_ros.settings import Settings
 
 S = 10**9
@@ -38,26 +38,26 @@ def test_a_stand_becomes_a_stop_of_the_longest_time_at_most(
 
 
 def test_a_stop_seen_before_is_known_where_and_when_it_was():
-    known = Known(np.array([True, False]), 9)
+    known = SampledStops(np.array([True, False]), 9)
     where, near = np.array([3.0, 0.2]), 1e-3
-    assert not known.meets(10, 20, where, near)
-    assert known.meets(20, 30, where, near)  # they touch
-    assert known.meets(5, 10, where, near)
-    assert known.meets(12, 14, where - [2.0 * np.pi, 0.0], near)
-    assert known.meets(12, 14, where + 0.9 * near, near)
-    assert not known.meets(12, 14, where + 1.1 * near, near)
-    assert not known.meets(12, 14, where - [0.0, 2.0 * np.pi], near)
-    assert not known.meets(1, 9, where, near)
-    assert not known.meets(21, 22, where, near)
+    assert not known.seen_before(10, 20, where, near)
+    assert known.seen_before(20, 30, where, near)  # they touch
+    assert known.seen_before(5, 10, where, near)
+    assert known.seen_before(12, 14, where - [2.0 * np.pi, 0.0], near)
+    assert known.seen_before(12, 14, where + 0.9 * near, near)
+    assert not known.seen_before(12, 14, where + 1.1 * near, near)
+    assert not known.seen_before(12, 14, where - [0.0, 2.0 * np.pi], near)
+    assert not known.seen_before(1, 9, where, near)
+    assert not known.seen_before(21, 22, where, near)
 
 
 @pytest.mark.parametrize(('stamp', 'met'), [(9, True), (10, False), (20, False), (21, True)])
 def test_only_the_stop_that_stands_at_a_stamp_is_forgotten(stamp, met):
-    known = Known(np.array([True]), 9)
+    known = SampledStops(np.array([True]), 9)
     where = np.zeros(1)
-    known.meets(10, 20, where, 1e-3)
+    known.seen_before(10, 20, where, 1e-3)
     known.forget(stamp)
-    assert known.meets(10, 20, where, 1e-3) == met
+    assert known.seen_before(10, 20, where, 1e-3) == met
 
 
 def test_rests_unseen_count_once_each_up_to_a_capacity():
