@@ -153,7 +153,6 @@ def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[T
         found.errors[robot.serial] |= wrong
     if not present:
         return []
-    nights = tuple((row.source, row.time) for row in rows)
     rows = tuple(row for row in rows if row.software == calib_ros.__version__)
     done = {(row.source, row.fingerprint) for row in rows if row.fingerprint}
     names = {each.name for each in present}
@@ -164,7 +163,7 @@ def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[T
         if (source.name, source.fingerprint) not in done:
             own = {inputs: name for inputs, name in known.items() if name == source.name}
             page = out is not None and source == last
-            tasks.append(Task(robot, source, own or known, page, nights))  # touched or copied
+            tasks.append(Task(robot, source, own or known, page))  # touched or copied
     return tasks
 
 
@@ -175,9 +174,8 @@ def _without_page(robot: Robot, history: History, out: Path | None, found: Run) 
     rows = results(robot, history.rows(robot.serial))
     if not rows or rows[-1].source in names or page_path(out, rows[-1]).exists():
         return []
-    last, nights = rows[-1].source, tuple((row.source, row.time) for row in rows)
     present, _ = sources(robot)
-    return [Task(robot, each, {}, True, nights) for each in present if each.name == last]
+    return [Task(robot, each, page=True) for each in present if each.name == rows[-1].source]
 
 
 def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, found: Run) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
@@ -20,12 +20,11 @@ from calib_ros.files.history import is_local
 from calib_ros.files.loading import TABLES, load_bag, load_table, table
 from calib_ros.files.unpacked import RECORDED
 from calib_ros.fleet.plant import Robot
-from calib_ros.identification.age import NEVER, measured_at
+from calib_ros.identification.age import measured_at
 from calib_ros.report.documents import configuration_yaml
 from calib_ros.report.page import Origin, render
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
-from calib_ros.sampling.dataset import Dataset
 from calib_ros.sampling.session import CalibrationSession
 
 DATES = ('mtime', 'LastModified', 'last_modified', 'Last-Modified')
@@ -51,15 +50,13 @@ class SourceFile(NamedTuple):
 class Task:
     """A source to identify, with a `page` if wanted, unless its content is `known`.
 
-    `known` maps hashes of contents to the source filed with them, if it still exists; `nights`
-    are sources and times of all results of the robot.
+    `known` maps hashes of contents to the source filed with them, if it still exists.
     """
 
     robot: Robot
     source: SourceFile
     known: Mapping[str, str] = field(default_factory=dict)
     page: bool = False
-    nights: Sequence[tuple[str, datetime]] = ()
 
 
 class Outcome(NamedTuple):
@@ -127,8 +124,7 @@ def _outcome(task: Task, path: Path) -> Outcome:
     chain, settings = robot.chain, robot.settings
     if path.suffix.lower() in TABLES:  # anything else is a bag
         sessions = (source.session,) if source.session else ()
-        found = _uncounted(table(path, chain, settings, sessions), task)
-        loaded = load_table(found, chain, settings)
+        loaded = load_table(table(path, chain, settings, sessions), chain, settings)
     else:
         session = CalibrationSession(chain, settings)
         loaded = load_bag(session, replay(path, session), robot.largest_loss)
@@ -145,26 +141,6 @@ def _outcome(task: Task, path: Path) -> Outcome:
     poses = poses_of(problem, result, loaded.by_line)
     report = identification_report(problem, result, poses, origin, warnings, wanted)
     return Outcome(row, page=render(report, f'../../{PLOTLY}') or '')
-
-
-def _uncounted(found: Dataset, task: Task) -> Dataset:
-    """Return a table without the poses that it had in an earlier night, if it has grown."""
-    sets = (*found.fitted, *found.held_out)
-    last = measured_at(sets, NEVER)
-    nights = (t for source, t in task.nights if source == task.source.name and t < last)
-    then = max(nights, default=NEVER)
-    up_to = 1e9 * then.timestamp() + 1e6  # a row has its time to a microsecond
-    new = [each.select(each.stamps_ns > up_to) for each in sets]
-    count = sum(map(len, new))
-    if then == NEVER or count == sum(map(len, sets)):
-        return found
-    fitted = [each for each in new[: len(found.fitted)] if len(each)]
-    bases = {each.base for each in fitted}
-    pairs = [pair for pair in found.pairs if bases.issuperset(pair)]
-    up_to_then = f'its poses up to {then:%Y-%m-%d %H:%M} UTC'
-    note = f'{up_to_then} were counted before: {count} others are used'
-    held_out, warnings = new[len(found.fitted) :], (*found.warnings, note)
-    return replace(found, fitted=fitted, held_out=held_out, pairs=pairs, warnings=warnings)
 
 
 @contextmanager
