@@ -44,14 +44,12 @@ class Step:
     held: bool = False
     """Whether a frame that the chain file holds is wrong from the first pose on."""
     slow: bool = False
-    """Whether it crept over the whole session, which harms if the arm imitates it."""
+    """Whether it crept over the whole session."""
 
     @property
     def harmful(self) -> bool:
         """Tell whether the step spoils the fit: it mixes two arms, or describes a past one."""
-        if self.slow and self.share < 1.0:
-            return False
-        return self.kind not in FRAMES or not self.unused
+        return not self.slow and (self.kind not in FRAMES or not self.unused)
 
     def __str__(self) -> str:
         return str(self.reason)

@@ -54,10 +54,11 @@ def find_step(fitted: Fitted, held: bool = False) -> Step | None:
     if found is None and fitted.noise.position >= SUSPICIOUS:
         scan, found = _searched(fitted, loaded=True)
     if found is not None:
-        if scan.drifts(found):  # between the means of both halves
-            if not found.stop or fitted.problem.sets[found.group.sets[0]].socket:
+        if scan.drifts(found):
+            creeps = found.stop and found.group.kind in FRAMES
+            if not creeps or fitted.problem.sets[found.group.sets[0]].socket:
                 return None
-            found = replace(found, size=2.0 * found.size, slow=True)
+            found = replace(found, size=2.0 * found.size, slow=True)  # the halves' means differ
         return scan.described(found)
     found = plain.imitated(fitted)
     if found is not None and found.group.kind == 'joint' and fitted.robust.outliers.any():
@@ -237,12 +238,6 @@ class _Scan:
         groups = [each for each in groups if not each.held]
         trials = np.log(self._stops * len(self._groups))
         for group in groups:
-            rows, own = self._growing(group)
-            if group.kind in FRAMES and arm.gains(rows, own)[0] >= LEAST + trials:
-                odds, size = arm.move_odds(rows[0], own[0])
-                if odds - trials > highest:
-                    highest = odds - trials
-                    found = _Found(group, self._stops // 2, size, 1.0, 0.0, slow=True)
             gains = arm.gains(*self._moving(group, every))
             k = int(np.argmax(gains))
             if gains[k] < LEAST + trials:
@@ -271,15 +266,6 @@ class _Scan:
         own = products[:, [self._added.index(name) for name in group.names]]
         columns = [self._names.index(name) for name in group.names]
         return own[:, :, [*range(self._fitted), -1]], own[:, :, columns]
-
-    def _growing(self, group: _Group) -> tuple[FloatArray, FloatArray]:
-        """Return products as `_moving` of moves that grow over the session, to 1 at its end."""
-        columns, whole = [self._names.index(name) for name in group.names], np.zeros(())
-        for rows, numbers in zip(self._rows, self._numbers, strict=True):
-            moving = rows[columns] * (numbers / self._stops)
-            whole = whole + gram(np.concatenate([moving, rows[: self._fitted], rows[-1:]]))
-        own = len(columns)
-        return whole[np.newaxis, :own, own:], whole[np.newaxis, :own, :own]
 
     def _to_the_end(self, places: Index) -> FloatArray:
         """Return products (B, K, P + 1) of moved columns with all, from each stop to the end."""
