@@ -191,15 +191,14 @@ def _held_out_excess(problem: Problem, result: Identification) -> str:
         return ''
     if any(each.distances is not None or each.pixels is not None for each in sets):
         return ''
-    sigmas = problem.sigma_position, problem.sigma_orientation
-    squares = [
-        result.noise.position**2 * each.covariances(sigmas)
-        + result.posterior.expected(each.joints, each.base, each.tool)
-        for each in sets
-    ]
-    sizes = np.trace(np.concatenate(squares)[:, :3, :3], axis1=1, axis2=2)
-    likely = 1e3 * float(np.sqrt(sizes[judged.deciding].mean()))
-    found = judged.figures[1].rms_mm
+    sigmas, found = (problem.sigma_position, problem.sigma_orientation), judged.figures[1].rms_mm
+    squares = result.noise.position**2 * np.concatenate([s.covariances(sigmas) for s in sets])
+    if _rms_mm(squares[judged.deciding]) > NEARER * found:  # noise alone, as nearly always
+        return ''
+    squares += np.concatenate(
+        [result.posterior.expected(each.joints, each.base, each.tool) for each in sets]
+    )
+    likely = _rms_mm(squares[judged.deciding])
     if likely > NEARER * found:
         return ''
     return (
@@ -207,6 +206,11 @@ def _held_out_excess(problem: Problem, result: Identification) -> str:
         'expect: are device, target and arm the same, unmoved and true to scale? Stated errors '
         'hold for the fitted poses alone'
     )
+
+
+def _rms_mm(squares: FloatArray) -> float:
+    """Return the RMS length [mm] of positions with expected squares (N, 6, 6) of their errors."""
+    return 1e3 * float(np.sqrt(np.trace(squares[:, :3, :3], axis1=1, axis2=2).mean()))
 
 
 def _order(problem: Problem) -> str:
