@@ -66,8 +66,11 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
             'a bag can hold only poses or positions of one session, fixed device and target, all '
             'with an orientation or none, and some of them to fit'
         )
-    lost = {'covariance': 'covariances', 'velocity': 'motion of the arm'}
-    lost['approach'] = 'signs s1 ...'
+    lost = {
+        'covariance': 'covariances',
+        'velocity': 'motion of the arm',
+        'approach': 'signs s1 ...',
+    }
     lacking = [w for n, w in lost.items() if any(getattr(x, n) is not None for x in every)]
     if lacking:
         told = f'the bag has no {", ".join(lacking)} of the table: its result may differ'

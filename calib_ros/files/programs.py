@@ -192,7 +192,8 @@ def _read_csv(path: Path, chain: Chain) -> ProgramFile:
         approach[:, known] = np.sign(found.block([signs[k] for k in known]))
         program = replace(program, approach=approach)
 
-    mark = '\ufeff' * path.read_bytes().startswith(BOM_UTF8)
+    with path.open('rb') as file:
+        mark = '\ufeff' * (file.read(3) == BOM_UTF8)
 
     def text_with(corrected: Program) -> str:
         lines = csv.reader(io.StringIO(text, newline=''), delimiter=separator)
