@@ -62,7 +62,7 @@ def test_two_changed_zeros_are_told_by_name(earlier, joints):
 
 
 @pytest.mark.parametrize(
-    ('joint', 'turn'), zip(UR10E.joint_names[:5], (-3.6, 7.2, -3.6, 7.2, -3.6), strict=True)
+    ('joint', 'turn'), [*zip(UR10E.joint_names[:5], (-3.6, 7.2, -3.6, 7.2, -3.6), strict=True)]
 )
 def test_a_zero_that_is_off_by_a_turn_of_the_motor_is_the_only_change(
     earlier, joint, turn, unsearched
