@@ -62,7 +62,7 @@ class Observations(Shown):
     """(N,) [s] before the stamps at which the joints had these values."""
     base: str = 'base'
     tool: str = 'tool'
-    """Frames of the chain for these pairs."""
+    """Frames of the chain for these pairs: names that begin with base, and with tool."""
     socket: bool = False
     """The target is a ball in a socket at an unknown place: the origin of the world, whose axes
     are parallel to the arm's base."""
@@ -82,6 +82,9 @@ class Observations(Shown):
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if not (self.base.startswith('base') and self.tool.startswith('tool')):
+            ends = f'"{self.base:.100}" and "{self.tool:.100}"'
+            raise InputError(f'the names of frames begin with base and tool, not as {ends}')
         if self.plane and self.distances is None:
             raise InputError('a plane needs the heights over it as distances, zero where touched')
         if self.pixels is not None and self.points is None:

@@ -143,15 +143,15 @@ def test_rows_of_a_lost_target_are_gross_errors_only(rows, oriented):
 def test_rows_of_one_of_several_sets_are_told_with_its_device():
     """Of two devices nobody knew which rows were meant."""
     arm, rng = load_chain('ur10e'), np.random.default_rng(2)
-    true = faulty(arm, Cell(), rng).with_frame('second', random_frame(rng, 2.0))
+    true = faulty(arm, Cell(), rng).with_frame('base_2', random_frame(rng, 2.0))
     one, other = (arm.random_joints(40, rng) for _ in range(2))
     first = measure(true, one, rng, 5e-5, 2e-4)
-    there = measure(replace(true, base=true.frame('second')), other, rng, 5e-5, 2e-4)
+    there = measure(replace(true, base=true.frame('base_2')), other, rng, 5e-5, 2e-4)
     mixed = np.where(np.arange(40)[:, np.newaxis] < 3, 1e3, 1.0) * there.positions
-    second = replace(there, base='second', positions=mixed)
-    problem = Problem(arm.with_frame('second', true.frame('second')), first, more=(second,))
+    second = replace(there, base='base_2', positions=mixed)
+    problem = Problem(arm.with_frame('base_2', true.frame('base_2')), first, more=(second,))
     found = str(diagnose_alone(problem, true))
-    assert found.startswith('in the measurements with second alone, in lines 1 to 3 alone')
+    assert found.startswith('in the measurements with base_2 alone, in lines 1 to 3 alone')
 
 
 def test_lengths_of_a_wire_are_no_repeated_positions():

@@ -91,8 +91,8 @@ def test_a_camera_on_the_flange_bends_what_it_sees_itself():
 
 
 def test_devices_have_their_own_errors_and_targets_of_one_have_them_in_common():
-    first, other = samples(seen(base='base')), samples(seen(base='tracker', tool='ball'))
-    both = bends([first, samples(seen(30, tool='ball')), other])
+    first, other = samples(seen(base='base')), samples(seen(base='base_2', tool='tool_2'))
+    both = bends([first, samples(seen(30, tool='tool_2')), other])
     assert [each.shape for each in both] == [(54, 3, 50), (54, 3, 30), (54, 3, 50)]
     assert both[0][:27].any()
     assert both[1][:27].any()

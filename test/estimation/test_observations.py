@@ -128,6 +128,15 @@ def test_optional_arrays_must_fit_too(rng, name):
         replace(seen, **{name: np.zeros((19, 2))})
 
 
+@pytest.mark.parametrize('name', ['base', 'tool'])
+def test_the_name_of_a_frame_tells_its_side(rng, name):
+    """An axis that wobbles counted as random turns: no base was known by its name."""
+    seen, _ = moving(rng)
+    assert getattr(replace(seen, **{name: f'{name}_2'}), name) == f'{name}_2'
+    with pytest.raises(InputError, match=r'begin with base and tool, not as .*"tracker"'):
+        replace(seen, **{name: 'tracker'})
+
+
 def test_select_takes_optional_arrays_along(rng):
     seen, _ = moving(rng)
     seen = replace(seen, delay=rng.normal(size=20))

@@ -190,7 +190,7 @@ def test_all_that_was_measured_tells_samples_apart():
     rng = np.random.default_rng(0)
     rows = simulation.measure(CHAIN, CHAIN.random_joints(3, rng), rng)
     near = replace(rows, distances=np.ones(3))
-    several = [rows, near, replace(near, distances=np.full(3, 1.1)), replace(rows, tool='other')]
+    several = [rows, near, replace(near, distances=np.full(3, 1.1)), replace(rows, tool='tool_2')]
     several += [replace(rows, covariance=np.tile(k * np.eye(6), (3, 1, 1))) for k in (1, 2)]
     assert len({samples_hash([each]) for each in several}) == len(several)
     assert samples_hash([rows]) == samples_hash([rows.select(slice(None))])

@@ -66,7 +66,7 @@ def designs(draw):
     if draw(flag):
         seen = seen.select(np.sort(rng.integers(0, count, count)))  # duplicate rows
     sets = [replace(seen, stamps_ns=np.arange(1, count + 1) * 1_000_000_000)]
-    for target in ('second', 'third')[: draw(st.sampled_from([0, 0, 1, 2]))]:
+    for target in ('tool_2', 'tool_3')[: draw(st.sampled_from([0, 0, 1, 2]))]:
         other = replace(true, tool=random_frame(rng, 0.2))
         part = q[: draw(st.sampled_from([1, 1, 2, count]))]
         sets.append(replace(measured(other, part, 'pose', noise, rng), tool=target))
@@ -148,6 +148,6 @@ def test_a_target_seen_once_in_sweeps(robot, noise):
     true = faulty(robot, Cell(), rng)
     q = joints_of(robot, 'sweeps', 24, rng)
     other = replace(true, tool=random_frame(rng, 0.2))
-    once = replace(measured(other, q[:1], 'pose', noise, rng), tool='second')
+    once = replace(measured(other, q[:1], 'pose', noise, rng), tool='tool_2')
     problem = Problem(robot, measured(true, q, 'pose', noise, rng), more=[once])
     assert identify_model(problem, 'auto').verdicts

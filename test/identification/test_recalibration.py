@@ -355,17 +355,17 @@ def test_poses_that_do_not_tell_of_new_frames_are_too_few():
 
 def test_another_of_several_targets_may_be_new(earlier):
     true, second, chain = earlier[0], random_frame(np.random.default_rng(5), 0.2), UR10E
-    chain = chain.with_frame('second', second)
+    chain = chain.with_frame('tool_2', second)
 
     def seen(frame, count):
         rng = np.random.default_rng(count)
         q = UR10E.random_joints(count, rng)
-        return replace(measure(replace(true, tool=frame), q, rng, *NOISE), tool='second')
+        return replace(measure(replace(true, tool=frame), q, rng, *NOISE), tool='tool_2')
 
     first = problem(true, 50, 1).observations
     previous = Calibration.of(identify(Problem(chain, first, more=(seen(second, 20),), **SIGMAS)))
     moved = Problem(chain, seen(random_frame(np.random.default_rng(8), 0.2), 12), **SIGMAS)
-    found = recalibrate(previous, moved, 0.1, new=('second',))
+    found = recalibrate(previous, moved, 0.1, new=('tool_2',))
     assert found.accepted
     assert not found.changed
 
@@ -373,12 +373,12 @@ def test_another_of_several_targets_may_be_new(earlier):
 def test_one_device_that_sees_all_lengths_may_be_out_of_scale():
     """Not one of several, nor a held one; and nothing stretches the travel of a linear joint."""
     seen = problem(UR10E, 4, 0).observations
-    size, pair = np.ones(4), (seen, replace(seen, base='other'))
+    size, pair = np.ones(4), (seen, replace(seen, base='base_2'))
     assert _may_be_scaled(UR10E, (seen, seen))
     for chain, sets in (
         (UR10E.with_frame('base', Frame(fixed=True)), (seen,)),
         (SCARA, (seen,)),
-        (UR10E.with_frame('other', Frame()), pair),
+        (UR10E.with_frame('base_2', Frame()), pair),
         *((UR10E, (replace(seen, **more),)) for more in ({'distances': size}, {'socket': True})),
     ):
         assert not _may_be_scaled(chain, sets)
