@@ -28,6 +28,7 @@ from calib_ros.report.applied import plan_report
 
 TESTS = 'P1 to P5 of ISO 9283 in a cube of {:.3f} m, in {}; collisions are not checked'
 VISIT = 'visit P1 to P5 in turn, 30 times, and measure each time'
+NOISE = 'device noise: {:g} mm in each direction (--sigma-position)'
 WITH_TURNS = 'orientations are measured too (of a reflector alone: --measured position)'
 NOT_OF_TESTS = ('poses', 'accuracy', 'candidates', 'task', 'taken', 'draw', 'criterion', 'apart')
 ORIENTED = 'various orientations', 'one orientation'
@@ -39,7 +40,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     rng = np.random.default_rng(options.seed)
     nowhere = np.zeros((1, len(chain.joints)))
     imagined = measure(chain, nowhere, rng, oriented=options.measured == 'pose')
-    design = Design.of(Problem(chain, imagined, **common.settings_of(options).for_problem()))
+    settings = common.settings_of(options)
+    design = Design.of(Problem(chain, imagined, **settings.for_problem()))
     box = None if options.box is None else np.reshape(options.box, (2, 3))
     tracker = None if options.tracker is None else np.array(options.tracker)
     axis, cone = tuple(options.axis), np.radians(options.cone)
@@ -52,8 +54,9 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         else:
             joints, remarks, plan = _measurement(options, design, visibility, rng, work)
     table = [] if plan is None else planning.accuracy_in_words(plan)
-    if plan is not None and options.measured == 'pose':
-        remarks.append(WITH_TURNS)
+    if plan is not None:
+        remarks.append(NOISE.format(1e3 * settings.sigma_position))
+        remarks += [WITH_TURNS] if options.measured == 'pose' else []
     if chain.tool is None:
         place = ' '.join(f'{x:g}' for x in ASSUMED_TOOL)
         remarks.append(f'the tool is unknown: the target is assumed at {place} m from the flange')

@@ -242,14 +242,10 @@ def predictions(accuracy: FloatArray, at_random: FloatArray, wanted_mm: float | 
     for name, errors, line in (('planned', accuracy, SOLID), ('at random', at_random, DASHED)):
         known = np.isfinite(errors)
         data.append(_curve('lines+markers', name, count[known], 1e3 * errors[known], line=line))
-    layout: Figure = {
-        'xaxis': axis('poses measured'),
-        'yaxis': axis('predicted RMS error [mm]', type='log', **TICKS),
-    }
     if wanted_mm is not None:
-        at = {'x0': 0, 'x1': 1, 'y0': wanted_mm, 'y1': wanted_mm}
-        layout['shapes'] = [{'type': 'line', 'xref': 'paper', **at, 'line': DOTTED}]
-    return {'data': data, 'layout': layout}
+        data.append(_curve('lines', 'wanted', count[[0, -1]], np.full(2, wanted_mm), line=DOTTED))
+    up = axis('predicted RMS error [mm]', type='log', **TICKS)
+    return {'data': data, 'layout': {'xaxis': axis('poses measured'), 'yaxis': up}}
 
 
 def in_space(positions: FloatArray, name: str, **more: Any) -> Figure:

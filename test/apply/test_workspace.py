@@ -120,6 +120,7 @@ def test_a_map_holds_the_rms_of_each_cell(rng):
 @pytest.fixture
 def folder(arm, tmp_path):
     (tmp_path / 'result').mkdir()
+    arm = replace(arm, record={'robot_serial': '4711'})
     (tmp_path / 'result' / 'calibration.yaml').write_text(arm.dump())
     return 'result'
 
@@ -131,6 +132,7 @@ def test_workspace_writes_tables_words_and_figures(run, folder, tmp_path):
     found = {path.name for path in (tmp_path / 'map').iterdir()}
     assert found == set(WORKSPACE_FILES)
     text = (tmp_path / 'map' / 'workspace.md').read_text()
+    assert text.startswith('# Errors over the workspace: ur10e 4711')
     assert 'Where the calibration removes most' in text
     assert text.count('| expected to remain |') == 1
     assert 'Expected to remain: its uncertainty' in text
