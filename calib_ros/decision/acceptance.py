@@ -45,16 +45,14 @@ def refusals(
     failed = [*_fit_refusals(problem, result, own_behaviour)]
     validation = result.validation
     if validation is None:
-        text = 'too few poses to hold some out and test the result on them'
+        count = len(np.unique(result.fitted.after.configurations))
+        text = f'{count} different poses: too few to hold some out'
         return (*failed, Reason(Rule.CONFIGURATIONS, text))
     share = validation.share_of_outliers
     if share > MOST_OUTLIERS:
         if result.step is not None and not result.step.harmful:
             failed.append(result.step.reason)
-        text = (
-            f'{100.0 * share:.0f} % of the judged poses are outliers: their measurements and '
-            'predictions do not belong together'
-        )
+        text = f'{100.0 * share:.0f} % of the judged poses are outliers'
         return (*failed, Reason(Rule.OUTLIERS, text))
     gained = tuple(_gain_refusals(problem, result, validation, sized, scaled))
     before, after = validation.figures
@@ -137,7 +135,7 @@ def _gain_refusals(
     if after.rms_mm > largest and (before.rms_mm > largest or gain > limit):
         yield Reason(
             Rule.LARGEST_ERROR,
-            f'RMS {after.rms_mm:.{1 if largest >= 1.0 else 3}f} mm remains on held-out poses, '
+            f'RMS {after.rms_mm:,.{1 if largest >= 1.0 else 3}f} mm remains on held-out poses, '
             f'more than {largest:g} mm (largest_error)',
         )
     if not gain > limit:
@@ -151,8 +149,8 @@ def _gain_refusals(
     elif result.chance is not None and result.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
-            'a slow drift may explain the gain: moved to other poses, errors are explained just '
-            f'as well in {100.0 * result.chance:.0f} % of cases '
+            'a slow drift may explain the gain: shifted to the wrong poses, errors can be '
+            f'corrected just as well in {100.0 * result.chance:.0f} % of cases '
             f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )
     elif scaled:

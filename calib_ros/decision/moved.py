@@ -73,7 +73,7 @@ class Step:
             thing, of = f'the zero of {self.what}', ''
         text, more = f'{thing} moved {size}{of} before {where}', f' ({when})'
         if self.slow:
-            text = f'{thing} moved slowly, {size} over the session{of}'
+            text = f'{thing} seems to have moved slowly, {size} over the session{of}'
             more = '; if the poses follow an order, errors of the arm may look so: mix them'
         elif self.kind in OF_THE_ARM:
             text, more = f'{thing} changed before {where}', f' ({when}): poses differ {size}'

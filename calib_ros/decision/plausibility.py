@@ -202,8 +202,8 @@ def _held_out_excess(problem: Problem, result: Identification) -> str:
     if likely > NEARER * found:
         return ''
     return (
-        f'the held-out poses are {found / likely:.1f} times as far off as the fitted ones let '
-        'expect: are device, target and arm the same, unmoved and true to scale? Stated errors '
+        f'the error of the held-out poses is {found / likely:.1f} times what the fitted ones lead '
+        'to expect: are device, target and arm the same, unmoved and true to scale? Stated errors '
         'hold for the fitted poses alone'
     )
 

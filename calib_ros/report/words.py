@@ -317,8 +317,8 @@ def chance_in_words(chance: float) -> str:
     """Return how well drift explains the gain."""
     share = f'{100.0 * chance:.1f}' if chance >= 0.001 else 'less than 0.1'
     return (
-        f'Moved to other poses, errors are explained just as well in {share} % of cases: above '
-        f'{100.0 * (1.0 - CONFIDENT):.0f} % the improvement may only be drift of the device.'
+        f'Shifted to the wrong poses, errors can be corrected just as well in {share} % of cases: '
+        f'above {100.0 * (1.0 - CONFIDENT):.0f} % the improvement may only be drift of the device.'
     )
 
 
