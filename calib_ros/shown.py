@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError
+from calib_ros.texts import capitalised
 
 NAMED = 5  # items named in a sentence; a convention
 LISTED = 4 * NAMED  # items listed in a table or longer text
@@ -41,8 +42,8 @@ def rounded(value: float) -> str:
 
 
 def sentence(text: str) -> str:
-    """Return a text with its capital letter and full stop; a question keeps its mark."""
-    return f'{text[0].upper()}{text[1:]}{"" if text.endswith("?") else "."}'
+    """Return a text with its capital letter and full stop, unless it has an end of its own."""
+    return f'{capitalised(text)}{"" if text.endswith((".", "?")) else "."}'
 
 
 def counted(count: int, what: str) -> str:

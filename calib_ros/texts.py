@@ -217,6 +217,11 @@ def one_line(text: str) -> str:
     return ' '.join(''.join(c if c.isprintable() else ' ' for c in text).split())
 
 
+def capitalised(text: str) -> str:
+    """Return a text whose first word, but no name of the input, begins with a capital."""
+    return re.sub(r'\A[a-z](?=[a-z]*:? )', lambda letter: letter[0].upper(), text)
+
+
 def in_markdown(value: object) -> str:
     """Return a value as text within a line of Markdown, free of HTML."""
     text = MARKUP.sub(r'\\\g<0>', one_line(str(value)))

@@ -9,7 +9,6 @@ are written: a topic or a joint may have any name.
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import sys
 import textwrap
@@ -19,6 +18,7 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 from calib_ros.progress import Progress
+from calib_ros.texts import capitalised
 
 WIDTH = 80  # columns of help and of non-terminals, by convention
 EVERY_S = 2.0
@@ -81,9 +81,9 @@ class Screen:
         if self.quiet:
             self.reasons += [f'{text.removesuffix(":")} -> {step}' for step in steps[:1]]
             return
-        _print(_capitalise(text), '- ')
+        _print(capitalised(text), '- ')
         for k, step in enumerate(steps):
-            _print(_capitalise(step), f'  {k + 1}. ' if len(steps) > 1 else '  -> ')
+            _print(capitalised(step), f'  {k + 1}. ' if len(steps) > 1 else '  -> ')
 
     def warn(self, text: str, kind: str = 'warning') -> None:
         """Print a warning; to a file as one line."""
@@ -148,11 +148,6 @@ class Work(Progress):
                 bar.update(task, description=_printable(self.words))
                 if self.done.wait(FIRST_S / 5):
                     break
-
-
-def _capitalise(text: str) -> str:
-    """Return a text whose first word, but no name of the input, begins with a capital."""
-    return re.sub(r'\A[a-z](?=[a-z]*:? )', lambda letter: letter[0].upper(), text)
 
 
 def _print(text: str, head: str) -> None:

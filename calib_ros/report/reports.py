@@ -54,7 +54,8 @@ def identification_report(
     judged = result.validation or result.fitted
     reasons = advice_of(result)
     text = filter(None, _text(result, reasons, tolerance))
-    gain = sections.gain(judged) if result.accepted else ''
+    gain = sections.gain(judged)
+    gain = gain if result.accepted else gain.split(' → ')[0] * _sound(reasons)
     fitted = [counted(result.rank, 'parameter')]
     fitted += words.notes(result)[:1] if result.chain.effects else []
     scale = f'scale checked to {1e6 * problem.sigma_scale:g} ppm'
@@ -81,7 +82,7 @@ def identification_report(
         ),
         picture=sections.distribution(poses),
         steps=_steps(result, reasons, tolerance),
-        remarks=(*warnings, *notes),
+        remarks=tuple(map(sentence, (*warnings, *notes))),
         identity=sections.identity_of(
             result.chain,
             origin,
@@ -109,9 +110,11 @@ def result_standing(
         open_yet = 'not' in within or bool(result.remarks)
         whole = result.region is None or result.region.whole
         heading = f'Accepted{"" if whole else " near the measured poses"}{within}'
+        heading += ': check first' * bool(result.remarks)
         return Headline('open' if open_yet else 'good', heading)
-    if reasons[0].heading == GOOD_ARM.heading:
-        return Headline('info', 'Not accepted, nothing to correct: the robot stays as it was')
+    if _sound(reasons):
+        within = _within(result.validation or result.fitted, tolerance, 0)
+        return Headline('info', f'Nothing to correct{within}: the robot stays as it was')
     return Headline('bad', 'Not accepted: the robot stays as it was')
 
 
@@ -119,14 +122,18 @@ def _text(
     result: Identification, reasons: Sequence[Advice], tolerance: float | None
 ) -> Iterator[str]:
     """Yield what is said below the verdict."""
+    if result.accepted or _sound(reasons):
+        how = 'Each pose is judged by a fit without it' if result.accepted else 'The arm as it is'
+        whole = ' The whole interval must be within the tolerance.' * (tolerance is not None)
+        yield f'{how}; 95 % interval in brackets.{whole}'
+        if count := (result.validation or result.fitted).outliers:
+            yield f'{counted(count, "outlier")}, listed below: not in these figures.'
     if result.accepted:
-        how = 'Each pose is judged by a fit without it; 95 % interval in brackets.'
-        yield how + ' The whole interval must be within the tolerance.' * (tolerance is not None)
         yield from doubts(result)
         yield f'The calibration is {result.region.in_words()}.' if result.region else ''
         yield f'{NOT_YET}.'
         return
-    if reasons[0].heading != GOOD_ARM.heading:
+    if not _sound(reasons):
         yield f'Why: {". ".join(each.in_short for each in reasons if each.steps)}.'
     yield 'No correction was saved or sent to the robot. The figures show the correction tried.'
 
@@ -136,12 +143,17 @@ def doubts(result: Identification) -> tuple[str, ...]:
     return tuple(sentence(f'Check before you use it: {each}') for each in result.remarks)
 
 
-def _within(judged: Comparison, tolerance: float | None) -> str:
-    """Return whether the remaining error is within the tolerance [m], if given."""
+def _sound(reasons: Sequence[Advice]) -> bool:
+    """Tell whether a result is refused because the arm shows no errors."""
+    return any(each.heading == GOOD_ARM.heading for each in reasons)
+
+
+def _within(judged: Comparison, tolerance: float | None, when: int = 1) -> str:
+    """Return whether the error before (0) or after is within the tolerance [m], if given."""
     if tolerance is None:
         return ''
     wanted = f'within the tolerance of {1e3 * tolerance:g} mm RMS'
-    lower, upper = interval_of(judged, 1)
+    lower, upper = interval_of(judged, when)
     if upper <= tolerance:
         return f' and {wanted}'
     return f', but {"" if lower > tolerance else "perhaps "}not {wanted}'
@@ -181,7 +193,7 @@ def _steps(
     result: Identification, reasons: Sequence[Advice], tolerance: float | None
 ) -> tuple[str, ...]:
     if not result.accepted:
-        return () if reasons[0].heading == GOOD_ARM.heading else (reasons[0].again,)
+        return () if _sound(reasons) else (reasons[0].again,)
     lower, upper = interval_of(result.validation or result.fitted, 1)
     beyond = tolerance is not None and lower > tolerance
     undecided = tolerance is not None and lower <= tolerance < upper

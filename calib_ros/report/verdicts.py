@@ -35,10 +35,11 @@ COMPUTED = (
 )
 NO_SCALE = 'Intervals do not include a scale error of the device: check it with a known length.'
 TOLERANCE = 'For PASS or FAIL, give --tolerance, the RMS error [mm] that your task allows.'
+ARCHIVE = 'Keep this page with the calibration. Verify again after a collision or repair.'
 STANDINGS: dict[str, tuple[Headline, tuple[str, ...]]] = {
     'PASS': (
         Headline('good', 'PASS: the arm is within the tolerance'),
-        ('Keep this page with the calibration. Verify again after a collision or repair.',),
+        (ARCHIVE,),
     ),
     'FAIL': (
         Headline('bad', 'FAIL: the arm exceeds the tolerance'),
@@ -58,7 +59,7 @@ STANDINGS: dict[str, tuple[Headline, tuple[str, ...]]] = {
     ),
     'holds': (
         Headline('good', f'The calibration holds: at most {ALIKE:g} times the expected error'),
-        (TOLERANCE,),
+        (ARCHIVE, TOLERANCE),
     ),
     'no verdict': (Headline('info', 'No verdict without a tolerance'), (TOLERANCE,)),
 }
@@ -220,9 +221,7 @@ def verification_report(
     chain: Chain, found: Verification, poses: Poses, origin: Origin, warnings: Sequence[str] = ()
 ) -> Report:
     """Return the report of a verification of a calibrated chain."""
-    text = [
-        f'The RMS position error over poses like these, each counted once, is {likely_rms(found)}.'
-    ]
+    text = [f'Over poses like these, each counted once: RMS {likely_rms(found)}.']
     if found.fitted:
         text.append('The interval allows for the refitted frames.')
     if found.limit is not None and not found.mistake:
@@ -241,7 +240,8 @@ def verification_report(
     if found.by_program and found.each:  # the figures of the standard come first
         pictured, others = others[0], [pictured]
     gain = sections.gain(found.comparison, intervals=False)
-    different = 'Different poses', f'{found.configurations:,}'
+    count = found.configurations
+    different = 'Different poses', f'{count:,}' * (count < len(poses))
     return Report(
         kind='Verification of a calibrated arm',
         robot=chain.name,
@@ -257,7 +257,7 @@ def verification_report(
         ),
         picture=pictured,
         steps=steps,
-        remarks=(*warnings, *map(sentence, not_steps(hints(found) + causes(found), steps))),
+        remarks=tuple(map(sentence, (*warnings, *not_steps(hints(found) + causes(found), steps)))),
         identity=sections.identity_of(chain, origin, poses, [different], table_hash(chain)),
         explorer=explorer(chain, poses),
         sections=(*others, sections.coverage(chain, poses.joints, 'How far each joint was moved')),

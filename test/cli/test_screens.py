@@ -274,7 +274,7 @@ def test_quiet_says_nothing_but_what_is_asked_for(shown):
     assert shown('identify', 'measured.csv', *UR5E, '--quiet') == (0, '')
     assert shown('identify', 'measured.csv', *UR5E, '--quiet', '--json')[1].startswith('{')
     status, text = shown('identify', 'good_arm.csv', *UR5E, '--quiet')
-    words = 'calib_ros: Not accepted, .*\ncalib_ros: There is nothing to correct .* -> To .*\n'
+    words = 'calib_ros: Nothing to correct: .*\ncalib_ros: There is nothing .* -> To .*\n'
     assert (status, re.fullmatch(words, text) is None) == (3, False)
 
 

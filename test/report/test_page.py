@@ -201,10 +201,10 @@ def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, sigma, state
     problem = Problem(UR, rows, sigma_position=sigma, sigma_orientation=2.0 * sigma)
     result = identify(problem)
     assert {each.rule for each in result.refusals} == {Rule.GAIN}
-    report = report_of(problem, result)
-    assert report.verdict.state == state
-    assert 'Not accepted' in report.verdict.heading
-    assert (report.advice[0].meaning == advice.GOOD_ARM.meaning) == (state == 'info')
+    report = report_of(problem, result, tolerance=1e-3)
+    told, good = report.verdict, state == 'info'
+    assert (told.state, 'tolerance' in told.heading, '0.' in told.gain) == (state, good, good)
+    assert (report.advice[0].meaning == advice.GOOD_ARM.meaning) == good
 
 
 def test_the_verdict_of_an_accepted_result_says_where_it_holds_and_what_is_doubtful(solved):
@@ -226,7 +226,7 @@ def test_the_verdict_of_an_accepted_result_says_where_it_holds_and_what_is_doubt
     report = report_of(problem, doubtful)
     verdict = report.verdict
     assert 'ur3' in verdict.text[1]
-    assert verdict.state == 'open'
+    assert (verdict.state, verdict.heading) == ('open', 'Accepted: check first')
     assert report.steps[0].startswith('First check what is named above')
 
 
@@ -307,7 +307,7 @@ def test_a_verification_has_its_verdict_first(solved):
     where = [page.text.index(words) for words in order]
     assert where == sorted(where)
     assert page.text.count('not the corrected robot') == 1
-    assert f'Poses {TEST}  Different poses {TEST}' in page.text
+    assert f'Poses {TEST}  Report made' in page.text
     assert f'{1e3 * found.upper:.3f} mm' in page.text
     assert len(page.data['explorer']['role']) == TEST
     sets = (problem.held_out.select(np.arange(TEST) // 2),)

@@ -126,7 +126,7 @@ def test_the_error_told_is_the_one_within_its_limits():
     fitted = replace(found, reused=0.1)  # no night of a chart
     assert verification_row(arm, fitted, filing).rms_freedom is None
     report = verification_page(arm, [seen], found)
-    assert f'each counted once, is {1e3 * found.rms:.3f} mm' in report.verdict.text[0]
+    assert f'each counted once: RMS {1e3 * found.rms:.3f} mm' in report.verdict.text[0]
     assert any('refitted' in each for each in report.verdict.text)
 
 
@@ -158,6 +158,7 @@ def test_far_more_than_noise_is_left_asks_what_was_loose_even_if_accepted(solved
     said = f'{9.0 * FAR:.0f} times the stated device noise: check that target and device sit'
     assert said in str(report_of(problem, coarse).remarks)
     assert said not in str(report_of(problem, result).remarks)
+    assert report_of(problem, result, warnings=('it is old',)).remarks == ('It is old.',)
 
 
 def test_poses_outside_the_region_do_not_lead_to_more_of_them():
