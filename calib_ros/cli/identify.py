@@ -44,7 +44,6 @@ from calib_ros.texts import dump_json
 PAGES = ('report.html', 'report.md', 'residuals.csv', 'before_after.png')
 RESULT_FILES = ('calibration.yaml', 'result.json', 'settings.yaml', *PAGES)
 REPORTS = (*PAGES, 'report.pdf')
-UNCHANGED = f'{reports.NOT_YET}: {reports.BRING}'
 STAYS = 'the arm is unchanged within the uncertainty: the correction that it has stays valid'
 NOT_OF_UPDATES = ('history', 'tolerance', 'pdf', 'model', 'fixed', 'priors', 'folds')
 
@@ -144,7 +143,8 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
     if found.accepted:
         names = (name for reasons in found.changed for each in reasons for name in each.names)
         same = all(map(found.calibration.chain.owns_frame, names))
-        screen.bullet(STAYS if same else UNCHANGED)
+        unchanged = f'{reports.NOT_YET}: {reports.bring(found.calibration)}'
+        screen.bullet(STAYS if same else unchanged)
 
 
 def _intervals(judged: Comparison | None) -> str:
@@ -272,7 +272,8 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
     if result.accepted:
         disturbed = words.disturbed_in_words(result.noise)
         closer = reports.CLOSER if reports.may_be_closer(result) else ''
-        notes = *reports.doubts(result), disturbed, *words.notes(result), closer, UNCHANGED
+        unchanged = f'{reports.NOT_YET}: {reports.bring(result)}'
+        notes = *reports.doubts(result), disturbed, *words.notes(result), closer, unchanged
         for note in notes:
             if note:
                 screen.bullet(note)

@@ -34,6 +34,10 @@ BRING = (
     'give the correction to its controller (calib_ros export, or ~/export of the node), or '
     'correct its programs (calib_ros compensate)'
 )
+BRING_NEAR = (
+    'correct its programs (calib_ros compensate), which refuses other poses; in its controller '
+    'the correction would act everywhere'
+)
 CLOSER = (
     'to get closer, identify with --model auto: it also corrects gears, gravity and backlash '
     'where that helps'
@@ -138,6 +142,11 @@ def _text(
     yield 'No correction was saved or sent to the robot. The figures show the correction tried.'
 
 
+def bring(found: Identification | Calibration) -> str:
+    """Return how the correction comes to the robot."""
+    return BRING if found.region is None or found.region.whole else BRING_NEAR
+
+
 def doubts(result: Identification) -> tuple[str, ...]:
     """Return the checks to make before using an accepted result."""
     return tuple(sentence(f'Check before you use it: {each}') for each in result.remarks)
@@ -205,7 +214,7 @@ def _steps(
         'Compare the remaining error with the accuracy of the measuring device: no calibration '
         'gets below that.': beyond,
         f'Measure more poses to decide on the tolerance, {SPREAD_OUT}.': undecided,
-        sentence(BRING): True,
+        sentence(bring(result)): True,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
         'arm: calib_ros verify.': whole,
         'Then measure at least five new poses near these and judge the corrected arm: calib_ros '
@@ -232,7 +241,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
         ),
     )
     if poses.outlier.any():
-        yield _outliers(poses)
+        yield sections.outliers(poses)
     yield from _offsets(problem, result)
     yield _parameters(result)
     yield _correlations(result)
@@ -290,26 +299,6 @@ def _effects(result: Identification) -> Section:
         'and does better; its error is at the top.',
         head=('effect', 'changes the error by', 'used'),
         rows=tuple(rows),
-    )
-
-
-def _outliers(poses: Poses) -> Section:
-    after = 1e3 * np.linalg.norm(poses.after, axis=1)
-    rows = np.flatnonzero(poses.outlier)
-    rows = rows[np.argsort(-after[rows])]
-    more = ' The 50 largest are shown.' if len(rows) > 50 else ''
-    return section(
-        'outliers',
-        f'Outliers: {len(rows):,} of {len(poses):,} {poses.things}',
-        'They differ from the others by more than this arm and device explain: little or no '
-        'weight in the fit, none in the figures. Measure them again, or find out what happened.'
-        f'{more}',
-        head=('from', poses.things[:-1], 'times the usual error', 'error after [mm]'),
-        rows=tuple(
-            (poses.source(k), str(k + 1), size, f'{after[k]:.3f}')
-            for k in rows[:50].tolist()
-            for size in ('held out' if np.isnan(poses.size[k]) else f'{poses.size[k]:.1f}',)
-        ),
     )
 
 

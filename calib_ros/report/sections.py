@@ -128,6 +128,27 @@ def distribution(poses: Poses) -> Section:
     )
 
 
+def outliers(poses: Poses) -> Section:
+    """Return the outliers, largest first."""
+    after = 1e3 * np.linalg.norm(poses.after, axis=1)
+    rows = np.flatnonzero(poses.outlier)
+    rows = rows[np.argsort(-after[rows])]
+    more = ' The 50 largest are shown.' if len(rows) > 50 else ''
+    return section(
+        'outliers',
+        f'Outliers: {len(rows):,} of {len(poses):,} {poses.things}',
+        'They differ from the others by more than this arm and device explain: little or no '
+        'weight in the fit, none in the figures. Measure them again, or find out what happened.'
+        f'{more}',
+        head=('from', poses.things[:-1], 'times the usual error', 'error after [mm]'),
+        rows=tuple(
+            (poses.source(k), str(k + 1), size, f'{after[k]:.3f}')
+            for k in rows[:50].tolist()
+            for size in ('held out' if np.isnan(poses.size[k]) else f'{poses.size[k]:.1f}',)
+        ),
+    )
+
+
 def coverage(chain: Chain, joints: FloatArray, title: str) -> Section:
     """Return how far joint values (N, n) reach in the range of each joint."""
     figure, rows = figures.histogram(chain, joints)

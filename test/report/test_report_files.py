@@ -109,6 +109,15 @@ def test_a_certificate_is_one_sheet(solved, monkeypatch):
     assert len(of_the_certificate(replace(report, verdict=refused), monkeypatch)) == 1
 
 
+def test_who_signs_reads_what_is_not_given(solved):
+    report = report_of(*solved)
+    known = ('Serial number', '7'), ('Operator', 'A. Smith'), ('Measuring device', 'T')
+    report = replace(report, identity=known)
+    assert 'Not given: conditions.' in page_of(report).text
+    given = replace(report, identity=(*known, ('Conditions', '21 °C')))
+    assert 'Not given' not in page_of(given).text
+
+
 @pytest.mark.parametrize('poses', [5, 20])
 def test_the_figures_of_the_standard_are_on_the_certificate(solved, monkeypatch, poses):
     _, result = solved
