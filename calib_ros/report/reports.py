@@ -36,7 +36,7 @@ BRING = (
 )
 BRING_NEAR = (
     'correct its programs (calib_ros compensate), which refuses other poses; in its controller '
-    'the correction would act everywhere'
+    '(calib_ros export) the correction would act everywhere'
 )
 CLOSER = (
     'to get closer, identify with --model auto: it also corrects gears, gravity and backlash '
