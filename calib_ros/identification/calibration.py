@@ -302,8 +302,8 @@ class Calibration(Shown):
         shift, turn = self.sigma(joints), self.sigma(joints, np.s_[3:])
         words = (
             'uncertainty of these poses (one sigma): at most '
-            f'{1e3 * shift.max(initial=0.0):.3f} mm at the target measured and '
-            f'{1e3 * turn.max(initial=0.0):.3f} mrad'
+            f'{1e3 * shift.max():.3f} mm at the target measured and '
+            f'{1e3 * turn.max():.3f} mrad'
         )
         if np.sum(turn**2) <= np.sum(turned**2):
             return words, ''

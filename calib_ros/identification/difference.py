@@ -242,5 +242,5 @@ def _information(
 
 
 def _chance(information: Information, freedom: float, explained: int = 0) -> float:
-    rank = max(1, len(information.names) - explained)
+    rank = len(information.names) - explained
     return chance_of(information.explained(np.eye(len(information.names)))[0], rank, freedom)

@@ -48,11 +48,10 @@ class LinearModel:
         self._chain = geometric.chain
         self._names = geometric.names
         posterior = geometric.posterior
-        priors = {n: s for n, s in posterior.priors.items() if n in self._names}
         self._noise, self._sizes = geometric.noise.size, dict(posterior.sizes)
         # couplings may be confused with errors of a joint's own drive
         self._sizes['drive'] = max(self._sizes.get(k, 0.0) for k in ('drive', 'coupling'))
-        problem = replace(problem, learned=Learned(priors, self._noise))
+        problem = replace(problem, learned=Learned(posterior.priors, self._noise))
         self._problem = problem
         ends = np.cumsum([len(each) for each in problem.sets])
         share = max(1, -(-int(ends[-1]) // COMPARED))

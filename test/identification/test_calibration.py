@@ -259,7 +259,7 @@ GOOD = {'nominal': nominal_document(UR), 'rms_mm_after': 0.1, 'world_frame': 'tr
             ('ur10e', GOOD | {key: value}, rf'c\.yaml: calibration\.{key} must be')
             for key, values in {
                 'accepted': ('no', 0, None),
-                'rms_mm_after': (float('nan'), 'small', -0.1),
+                'rms_mm_after': (float('nan'), float('inf'), 'small', -0.1),
                 'world_frame': (5, None),
             }.items()
             for value in values

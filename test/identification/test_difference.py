@@ -11,6 +11,7 @@ from fits import NOISE, SCARA, SIGMAS, UR10E as UR
 from measured import bent
 from robots import DATA, needs_data
 from scipy.linalg import block_diag
+from scipy.stats import chi2
 
 from calib_ros import Calibration, Observations, Problem, difference, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -23,6 +24,7 @@ from calib_ros.decision.changes import (
 )
 from calib_ros.errors import InputError
 from calib_ros.identification.age import drift_of
+from calib_ros.identification.difference import _chance, _change
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 
 UR10 = DATA / 'ur10_ipa_leica'
@@ -136,8 +138,10 @@ def test_a_joint_that_was_bumped_is_named(nights):
     words = found.in_words()
     assert 'elbow_joint.theta by +0.' in words
     assert 'nothing else: was it bumped?' in words
-    (name, size), *others = found.rows()  # the largest in sigmas
-    assert (name, len(others)) == ('elbow_joint.theta', 5)
+    names, (size, *_) = zip(*found.rows(), strict=True)  # the largest in sigmas
+    order = np.argsort(-np.abs(found.change / found.sigma))[:6]
+    assert names == tuple(found.names[k] for k in order)
+    assert names[0] == 'elbow_joint.theta'
     assert re.fullmatch(r'\+0\.\d{3} ± 0\.0\d\d mrad \(95 %\)', size)
     told = found.document()
     sizes = [1e3 * each for each in (found.rms, found.limit, found.left)]
@@ -191,9 +195,17 @@ def test_what_a_parameter_shares_with_others_is_a_share():
     names = [Parameter('elbow_joint.d'), Parameter('elbow_joint.theta')]
     others = [Parameter('shoulder_lift_joint.d'), *names, Parameter('wrist_1_joint.a')]
     taken, left = gauge_map(UR, names, others, free=False)
-    np.testing.assert_allclose(taken[:, :3], [[1, 1, 0], [0, 0, 1]], atol=1e-9)
+    for shares in (taken[:, :3], _change(UR, names, others[:3])):
+        np.testing.assert_allclose(shares, [[1, 1, 0], [0, 0, 1]], atol=1e-9)
     np.testing.assert_allclose(left[:3], 0.0, atol=1e-9)
     assert 0.1 < left[3] < 1.0
+
+
+def test_what_is_left_has_the_fewer_directions_the_more_is_explained():
+    names = tuple(map(Parameter, ('elbow_joint.theta', 'elbow_joint.a', 'elbow_joint.alpha')))
+    information = Information(names, np.eye(3), np.array([1.0, 2.0, 2.0]))
+    found = [_chance(information, np.inf, explained) for explained in (0, 1, 2, 3)]
+    assert found == pytest.approx(chi2.sf(9.0, [3, 2, 1, 1]), rel=1e-4)
 
 
 def test_reasons_of_one_effect_are_told_together():

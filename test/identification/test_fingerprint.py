@@ -22,6 +22,8 @@ def test_rows_that_were_fitted_are_known_in_any_order(count):
     again = fitted.select(np.random.default_rng(2).permutation(count))
     rounding = replace(again, joints=again.joints + 1e-12, positions=again.positions - 1e-12)
     assert found.share([rounding]) == 1.0
+    last = fitted.select(np.argsort(hashes([fitted]))[[len(found.least) - 1]])  # of those kept
+    assert found.share([last]) == 1.0
     assert found.share([new]) == 0.0
     assert found.share([fitted, new]) == pytest.approx(0.5, abs=0.15)
     assert found.share([]) == 0.0

@@ -173,7 +173,9 @@ def test_a_model_is_named_in_the_settings(rng):
     unseen = UR10E.random_joints(300, rng)
     errors = {}
     for model in ('geometric', 'ratio', 'ratio+eccentricity'):
-        result = identify_model(Problem(UR10E, seen), model)
+        told = []
+        result = identify_model(Problem(UR10E, seen), model, told.append)
+        assert told == [f'model {model}', 1 / 2, 2 / 3]
         assert chosen(result) == (set() if model == 'geometric' else set(model.split('+')))
         assert result.verdicts == ()
         errors[model] = rms(result.chain, true, unseen)
@@ -363,11 +365,11 @@ def test_a_richer_model_is_used_unless_it_is_worse(before, richer, reason, monke
 
     def identified(given, simpler=None, progress=None):
         assert (simpler is before) == bool(given.effects)
-        progress(0.5)
+        progress(0.25)
         return replace(richer, richer=True) if simpler else before
 
     def chosen(given, result, progress):
-        progress(0.5)
+        progress(0.25)
         return ('elbow_joint.ratio',), verdicts
 
     monkeypatch.setattr(identification, 'identify', identified)
@@ -380,5 +382,5 @@ def test_a_richer_model_is_used_unless_it_is_worse(before, richer, reason, monke
     remark = f'the richer model is not used, because {reason}'
     assert found.remarks == ((remark,) if reason else ())
     fit, tried = len(problem.free) * 3, 2 * 38 * 6 * 3
-    done = np.array([0.5 * fit, fit + 0.5 * tried, 1.5 * fit + tried]) / (2 * fit + tried)
+    done = np.array([0.25 * fit, fit + 0.25 * tried, 1.25 * fit + tried]) / (2 * fit + tried)
     assert [share for share in shares if not isinstance(share, str)] == pytest.approx([*done])

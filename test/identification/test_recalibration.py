@@ -203,6 +203,7 @@ def test_one_pose_shows_no_change(earlier, seed):
         assert found.changed
         assert not found.determined
         assert not found.accepted
+        assert previous.step(single.all_sets) is None
     assert recalibrate(previous, seen, 0.1).accepted
 
 
