@@ -95,8 +95,9 @@ def freedom_of(moments: FloatArray) -> float:
 
 def moments_of(errors: FloatArray, group: Index) -> FloatArray:
     """Return the mean of e e^T (K, 3, 3) [m^2] of errors (N, 3) [m] over each configuration."""
-    sums = [[np.bincount(group, one * other) for other in errors.T] for one in errors.T]
-    return np.asarray((sums / np.bincount(group)).transpose(2, 0, 1))
+    sums = np.array([[np.bincount(group, a * b) for b in errors.T] for a in errors.T])
+    sums /= np.bincount(group)
+    return sums.transpose(2, 0, 1)
 
 
 SLOPES = (0.5, 2.0)

@@ -192,7 +192,9 @@ def joined(
 
     def rows(name: str) -> FloatArray:
         found = np.concatenate([getattr(piece, name) for piece in pieces])
-        return found if index is None else found.take(index, axis=0)
+        if index is None or np.isnan(found[:, 0]).all():  # or nothing was measured
+            return found
+        return found.take(index, axis=0)
 
     return Residuals(rows('position'), rows('orientation'), configurations, rows('pixels'))
 

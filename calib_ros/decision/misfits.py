@@ -75,6 +75,8 @@ def loose_target(sets: Sequence[Observations]) -> str:
     By the variance of their distances at the same configurations, without a tenth that may be
     gross errors, against that of the steadiest pair.
     """
+    if len(sets) < 3:
+        return ''
     places: list[dict[int, FloatArray]] = []
     varies: dict[tuple[str, str, str], tuple[float, int]] = {}
     for each, number in zip(sets, numbered(sets), strict=True):

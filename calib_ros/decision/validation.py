@@ -78,11 +78,10 @@ def _cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Compariso
         return None, 'nothing: too few poses to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
     numbers = [group % folds for group in groups]
-    chains = zip(
-        leave_fold_out(before, frames, fitted.system, numbers),
-        leave_fold_out(fitted.chain, names, fitted.system, numbers),
-        strict=True,
-    )
+    order = [np.argsort(each, kind='stable') for each in numbers]
+    by_fold = fitted.system.select(order), [*map(np.sort, numbers)]  # sorted once
+    fits = (before, frames), (fitted.chain, names)
+    chains = zip(*(leave_fold_out(one, some, *by_fold) for one, some in fits), strict=True)
     first, second = fold_residuals(chains, problem.sets, groups, numbers)
     judged = Comparison(first, second, ~fitted.robust.outliers)
     over = f'{folds}-fold cross-validation over {count:,} different poses'

@@ -218,7 +218,8 @@ class Samples:
             both = np.einsum('rsn,ns->nr', self.whitening, both)
             position, turned = both[:, :3], both[:, 3:]
             return position, np.where(self.observations.oriented[:, None], turned, np.nan)
-        return position / self.sigmas[0], orientation / self.sigmas[1]
+        turned = orientation / self.sigmas[1] if self.oriented else orientation
+        return position / self.sigmas[0], turned
 
     def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, Index | slice]]:
         """Yield residuals (M, c) in sigma, NaN if not measured, and each sample's row (N,)."""
