@@ -27,14 +27,13 @@ from calib_ros.sampling.messages import (
     JOINT_STATE,
     LINKS,
     TRANSFORMS,
-    MessageError,
     Reading,
     bodies_of,
     frame_name,
 )
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.slices import JOINTS, POSES, Part
+from calib_ros.sampling.slices import POSES, Part
 from calib_ros.sampling.sources import Source
 from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.texts import LARGEST_TABLE
@@ -136,7 +135,7 @@ def decode(
     parts: list[Part] = []
     problems: list[str] = []
     linked: dict[Links, tuple[list[Part], list[Part]]] = {}  # moving and still ones
-    decoded = _by_layout(batch, miss, problems)
+    decoded = _by_layout(batch, problems)
     others = _one_by_one(batch, deserialise, pictures, problems)
     for stream, part in itertools.chain(decoded, others):
         if stream.type != JOINT_STATE and any(name[:1] == '/' for name in part.strings):
@@ -153,9 +152,7 @@ def decode(
     return parts, problems
 
 
-def _by_layout(
-    batch: Batch, miss: Callable[[str, int, str], None], problems: list[str]
-) -> Iterator[tuple[Stream, Part]]:
+def _by_layout(batch: Batch, problems: list[str]) -> Iterator[tuple[Stream, Part]]:
     """Yield joint states and measurements with the same names, and their stream."""
     groups: dict[tuple[str, int, bytes], list[int]] = {}
     for place, (stream, data) in enumerate(batch):
@@ -172,8 +169,6 @@ def _by_layout(
         for k in np.flatnonzero(left).tolist():
             try:
                 message_layout(stream.type, blobs[k])
-            except MessageError as err:
-                miss(JOINTS, 1, str(err))
             except (struct.error, UnicodeDecodeError) as err:
                 problems.append(UNDECODED.format(stream.topic, err))
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
-from calib_ros.sampling.messages import FORMS, JOINT_STATE, TRANSFORMS, MessageError
+from calib_ros.sampling.messages import FORMS, JOINT_STATE, TRANSFORMS
 from calib_ros.sampling.slices import Stamps
 from calib_ros.values import MOST_NAMES
 
@@ -122,7 +122,7 @@ def alike(
         else:
             try:
                 layout = message_layout(kind, blobs[rest[0]])
-            except (struct.error, UnicodeDecodeError, MessageError):
+            except (struct.error, UnicodeDecodeError):
                 rest = rest[1:]
                 continue
             if len(layouts) == MOST_NAMES:
@@ -151,8 +151,6 @@ def message_layout(kind: str, blob: bytes) -> MessageLayout:
         if kind == JOINT_STATE:
             strings += [read.string() for _ in range(read.count())]
             count = read.integer()
-            if len(strings) != count + 1:
-                raise MessageError('names and positions differ in number')
         begin = _aligned(read.at + between, size)
         read.at = begin + count * size
         if read.at > len(blob):

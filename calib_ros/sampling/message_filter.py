@@ -16,6 +16,7 @@ from calib_ros.sampling.slices import (
     JOINTS,
     NO_ACCIDENT,
     POSES,
+    SILENCE,
     JointIndices,
     Part,
     Piece,
@@ -25,6 +26,8 @@ from calib_ros.settings import EXCEPTION
 from calib_ros.values import LARGEST, MOST_NAMES, ROUNDED, covariance_faults
 
 OTHERS = 'none of the joints in the message'
+NO_VALUES = 'no positions in the message'
+UNEVEN = 'names and positions differ in number'
 NO_STAMP = 'zero stamp (fill header.stamp where it is published)'
 NOT_UNIT = 'quaternion not of length 1 (normalise it where it is published)'
 NOWHERE = -1  # column of a joint that needs no name
@@ -40,6 +43,7 @@ class JointNames:
     def __init__(self, names: Sequence[str], held: Mapping[int, float] | None = None) -> None:
         self._names, self.held = names, held or {}
         self._heard: dict[str, tuple[float, float]] = {}  # lowest and highest value of others
+        self.blank: set[int] = set()  # joints of the chain that came without a position
 
     def layout(self, key: Sequence[str]) -> tuple[JointIndices, Index, str]:
         """Return the joints of the chain in messages, the columns (K,) of them, and any fault.
@@ -64,7 +68,7 @@ class JointNames:
             if own or name in self._heard or len(self._heard) < MOST_NAMES:
                 self._heard.setdefault(name, (np.inf, -np.inf))
                 others += [] if own else [k]
-        if not others:
+        if not others or numbers.shape[1] != len(names):
             return
         values = numbers[:, others]
         lowest, highest = np.fmin.reduce(values).tolist(), np.fmax.reduce(values).tolist()
@@ -95,8 +99,10 @@ class JointNames:
         ask = 'does their driver run, and publish them at rest too?'
         return [Hint(f'nothing can be sampled: {words}', f'{words}: {ask}')] if silent else []
 
-    def foreign_ones(self, missing: Sequence[int]) -> str:
-        """Return a hint that other joints arrive than the missing ones; empty if none do."""
+    def why_missing(self, missing: Sequence[int]) -> str:
+        """Return why joints are missing: no positions or other names arrive; empty if neither."""
+        if blank := ', '.join(self._names[k] for k in missing if k in self.blank):
+            return f'waiting for joint states with positions: none came of {blank}'
         if not (missing and self.foreign):
             return ''
         return (
@@ -254,9 +260,15 @@ class MessageFilter:
             places, _, (_, *names), stamps, numbers = part
             self._names.hear(names, numbers)
             columns, index, fault = self._names.layout(names)
-            if fault == OTHERS:  # such as a gripper's, which publishes apart
+            if numbers.shape[1] != len(names):
+                fault = fault or (UNEVEN if numbers.size else NO_VALUES)
+            if fault == NO_VALUES:
+                self._names.blank.update(columns)
+                if self.latest and stamps[-1] - self.latest[0] > 1e9 * SILENCE:
+                    self.refused[JOINTS] = fault  # the arm's, since its own have ended
+            if fault in (OTHERS, NO_VALUES):  # such as a gripper's, or efforts, published apart
                 self.received[JOINTS] += len(stamps)
-                self.unused[f'{JOINTS}: {OTHERS}'] += len(stamps)
+                self.unused[f'{JOINTS}: {fault}'] += len(stamps)
                 continue
             if fault:
                 self.miss(JOINTS, len(stamps), fault)

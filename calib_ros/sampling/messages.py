@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
-from calib_ros.errors import InputError
-
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 TRANSFORM = 'geometry_msgs/msg/TransformStamped'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
@@ -40,10 +38,6 @@ CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 
 Reading: TypeAlias = tuple[int, tuple[str, ...], Sequence[float]]
 """Stamp [ns], strings and numbers of one reading, as in `Part`."""
-
-
-class MessageError(InputError):
-    """A message that cannot be used."""
 
 
 def bodies_of(kind: str, message: Any) -> list[Reading]:

@@ -189,8 +189,8 @@ class CalibrationSession:
         track = self._collector.track
         for hint in self._names.silent_ones(track.silent()):
             return hint.status
-        if others := self._names.foreign_ones(track.missing):
-            return others
+        if missing := self._names.why_missing(track.missing):
+            return missing
         if why := self._filter.refused.get(JOINTS):
             return f'nothing can be sampled: joint states are refused, {why}'
         return self._collector.state()
@@ -256,8 +256,8 @@ class CalibrationSession:
     @property
     def doubtful(self) -> bool:
         """Tell whether the status says that messages are refused, or something looks wrong."""
-        others = self._names.foreign_ones(self._collector.track.missing)
-        wrong = self._filter.refused, self.pictures.refused, others, self._live.known.refused
+        missing = self._names.why_missing(self._collector.track.missing)
+        wrong = self._filter.refused, self.pictures.refused, missing, self._live.known.refused
         far = self.estimate and self.estimate.astray(self.settings.largest_error)
         return bool(any(wrong) or far or any(hint.status for hint in self.hints))
 

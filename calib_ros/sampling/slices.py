@@ -33,8 +33,9 @@ class Part(NamedTuple):
 
     The source is None for joint states and transforms. `strings` are frame and child frame (if
     any) of a measurement, or the frame and the joint names. `numbers` (N, w) are joint values [rad
-    or m]; or a distance [m] (w = 1), a position [m] (3), a pose with its quaternion x y z w (7),
-    or a pose and a covariance row by row (43); of an image its number (1).
+    or m], of a faulty publisher more or fewer than names; or a distance [m] (w = 1), a position
+    [m] (3), a pose with its quaternion x y z w (7), or a pose and a covariance row by row (43); of
+    an image its number (1).
     """
 
     places: Index

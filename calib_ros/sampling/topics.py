@@ -116,7 +116,7 @@ def check_joints(
     topics: dict[str, set[str]] = {name: set() for name in joint_names}
     for batch, _ in batches(recorded.messages_on(streams)):
         for part in decode(batch, recorded.deserialise)[0]:
-            for name in topics.keys() & part.strings[1:]:
+            for name in topics.keys() & part.strings[1:] if part.numbers.size else ():
                 topics[name].add(batch[part.places[0]][0].topic)
     twice = {name: found for name, found in topics.items() if len(found) > 1}
     if twice:

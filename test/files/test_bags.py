@@ -235,20 +235,22 @@ BAD_JOINTS = [
     (joint_state(55 * MS, (0.1, np.nan, 0.3)), 'joints: NaN or infinite joint value'),
     (joint_state(55 * MS, (0.1, np.inf, 0.3)), 'joints: NaN or infinite joint value'),
     (joint_state(55 * MS, (0.1, 0.2)), 'joints: names and positions differ in number'),
-    (joint_state(55 * MS, ()), 'joints: names and positions differ in number'),
 ]
 OTHERS = [joint_state(55 * MS, (0.1,), ('gripper',)), joint_state(55 * MS, (), ())]
+OTHERS += [joint_state(55 * MS, values, ('gripper', 'grip')) for values in ((), (0.1,))]
 
 
 @pytest.mark.parametrize(('first', 'behind'), [(True, 0), (False, 12)])
 def test_bad_joint_states_are_dropped_and_counted_by_cause(tmp_path, first, behind):
     events = standing([pose_stamped(55 * MS)])
     bad = [('/joint_states', message) for message in (*(each for each, _ in BAD_JOINTS), *OTHERS)]
+    bad.append(('/joint_states', joint_state(55 * MS, ())))
     events = [*bad, *events] if first else [*events, *bad]
     account = account_of(record(tmp_path / 'bag', events, behind=behind * b'x'))
     assert (account.joint_states, account.samples) == (100 + len(bad), 1)
     assert account.dropped == Counter(cause for _, cause in BAD_JOINTS)
     assert account.unused['joints: none of the joints in the message'] == len(OTHERS)
+    assert account.unused['joints: no positions in the message'] == 1
 
 
 def test_a_nan_of_a_foreign_joint_does_not_matter(tmp_path):

@@ -63,7 +63,8 @@ def shift(rng, stops=3):
         order = rng.permutation(6) if rng.random() < RARE else np.arange(6)
         come(stamp, joints(JOINTS, given, [ARM.joint_names[i] for i in order], row[order]))
         if k % 3 == 0:
-            come(stamp, joints(GRIPPER, stamp, ['finger'], [0.1]))
+            others = (['finger'], [0.1]) if k % 2 else (ARM.joint_names[::2], [])
+            come(stamp, joints(GRIPPER, stamp, *others))
         frame_id = 'elsewhere' if rng.random() < RARE else 'world'
         place = seen.positions[k] * (np.nan if rng.random() < RARE else 1.0)
         given = stray(stamp) if rng.random() < RARE else stamp

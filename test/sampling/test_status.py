@@ -182,6 +182,22 @@ def test_the_status_tells_why_no_joint_state_is_used(stamp, value, cause):
     assert made.status().startswith(said)
 
 
+def test_joint_states_without_positions_are_those_of_others_if_the_arm_sends_some():
+    """A gripper's, or an estimate of efforts, kept the diagnostics at WARN."""
+    gripper, efforts = (['finger'], []), (UR5E.joint_names, [])
+    made = named(gripper, efforts, (UR5E.joint_names, [0.1] * 6), gripper, efforts)
+    assert not made.doubtful
+    assert made.account().dropped == {}
+    made = named(gripper, *[(UR5E.joint_names[:3], [0.1] * 3), (UR5E.joint_names[3:], [])] * 2)
+    assert made.doubtful
+    assert made.status().startswith(
+        'waiting for joint states with positions: none came of wrist_1_joint, wrist_2_joint, '
+    )
+    made = named((UR5E.joint_names, [0.1] * 6))  # and a driver may send none later
+    take(made, of_joints(joint_state(10**18 + 6 * 10**9, *efforts)))
+    assert 'joint states are refused, no positions in the message' in made.status()
+
+
 def named(*messages):
     """Return a session that has heard joint states (names, values)."""
     made = session()
