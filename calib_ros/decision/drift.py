@@ -21,12 +21,13 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from calib_ros.estimation.configurations import group_means
+from calib_ros.estimation.gain import inverse_root
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import SEVERAL
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.samples import gram, summed
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, Index, norms
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index, norms
 
 SLOW = SEVERAL
 """Cosines removed from a series at most, one per ten stops (benchmarks/drift.py)."""
@@ -133,33 +134,6 @@ def slow_cosines(length: int) -> FloatArray:
     order = np.arange(1 + min(SLOW, length // 10))
     waves = np.cos(np.pi * np.outer(order, (np.arange(length) + 0.5) / length))
     return np.asarray(waves / np.linalg.norm(waves, axis=1, keepdims=True))
-
-
-def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
-    """Return T (..., P, P) with T T^T the pseudo-inverse of (..., P, P).
-
-    Columns are scaled to squared lengths `size` (..., P); directions lost to rounding are zero.
-    """
-    scale = 1.0 / np.sqrt(np.maximum(size, 1e-300))
-    sizes, vectors = np.linalg.eigh(matrix * (scale[..., np.newaxis] * scale[..., np.newaxis, :]))
-    good = sizes > ROUNDING
-    lengths = good / np.sqrt(np.where(good, sizes, 1.0))
-    return np.asarray(scale[..., np.newaxis] * vectors * lengths[..., np.newaxis, :])
-
-
-def gain_of(products: FloatArray, count: int) -> tuple[float, int, float]:
-    """Return the squares that added columns explain of the residual, and in how many directions.
-
-    By the products (P, P) of the first `count` columns, the added ones and the residual. The
-    squares left beside the first columns alone follow.
-    """
-    sizes, known, rest = np.diag(products), np.s_[:count], np.s_[count:]
-    root = inverse_root(products[known, known], sizes[known])
-    cross = products[rest, known] @ root
-    left = products[rest, rest] - cross @ cross.T
-    root = inverse_root(left[:-1, :-1], sizes[count:-1])
-    along = root.T @ left[:-1, -1]
-    return float(along @ along), int(root.any(axis=0).sum()), float(left[-1, -1])
 
 
 def chance(shares: FloatArray) -> float:

@@ -12,12 +12,12 @@ from itertools import combinations
 import numpy as np
 from scipy import special
 
-from calib_ros.decision.drift import gain_of
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import fit
+from calib_ros.estimation.gain import gain_of
 from calib_ros.estimation.leastsquares import stacked
 from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING
 from calib_ros.estimation.observations import Observations, numbered

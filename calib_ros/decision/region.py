@@ -21,9 +21,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy import special
 
-from calib_ros.decision.drift import inverse_root
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.estimation.evidence import MixtureTerm, Posterior
+from calib_ros.estimation.gain import inverse_root
 from calib_ros.estimation.joint_errors import (
     NOTHING,
     axis_parameters,

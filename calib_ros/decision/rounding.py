@@ -14,8 +14,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib_ros.decision.drift import gain_of
 from calib_ros.estimation.fitted import Fitted
+from calib_ros.estimation.gain import gain_of
 from calib_ros.estimation.leastsquares import row_samples, stacked
 from calib_ros.estimation.levels import CLEARLY, SURE, chance_of
 from calib_ros.estimation.problem import Problem

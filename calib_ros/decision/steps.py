@@ -21,13 +21,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from calib_ros.decision.drift import gain_of, inverse_root, slow_cosines
+from calib_ros.decision.drift import slow_cosines
 from calib_ros.decision.imitations import LEAST, Imitation
 from calib_ros.decision.moved import FRAMES, Step, thing_of
 from calib_ros.decision.trials import largest_of
 from calib_ros.estimation.configurations import stops
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import SOME
+from calib_ros.estimation.gain import gain_of, inverse_root
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
 from calib_ros.estimation.levels import LEAST_ASIDE, SURE, chance_of
 from calib_ros.estimation.problem import Problem

@@ -25,9 +25,9 @@ import numpy as np
 from calib_ros.annotated import as_annotated
 from calib_ros.decision import changes
 from calib_ros.decision.changes import ChangeColumns, Explanation, Information
-from calib_ros.decision.drift import inverse_root
 from calib_ros.errors import InputError
 from calib_ros.estimation.evidence import size_group
+from calib_ros.estimation.gain import inverse_root
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.levels import CONFIDENT, SEVERAL, chance_of
 from calib_ros.estimation.observations import SOME_POSES
