@@ -252,8 +252,8 @@ def sigma_over_range(result: Identification) -> dict[str, float]:
 def times_in_words(noise: Noise) -> str:
     """Return the ratio of the residuals to the device's noise."""
     turned = noise.orientation
-    text = '' if turned is None else f', {turned:.2f} times in orientation'
-    return f'{noise.position:.2f} times the stated device noise{text}'
+    text = '' if turned is None else f', {turned:,.2f} times in orientation'
+    return f'{noise.position:,.2f} times the stated device noise{text}'
 
 
 def scatter_in_words(noise: Noise) -> str:

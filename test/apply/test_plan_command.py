@@ -143,7 +143,7 @@ def test_plan_says_how_many_poses_a_wanted_error_needs(run, tmp_path):
     assert 18 <= count <= 26
     _, out, _ = run(*given, '--poses', 10)
     assert f'{count} poses reach 0.1 mm' in out
-    assert out.splitlines()[-5].split()[0] == '10'
+    assert out.splitlines()[-6].split()[0] == '10'
 
 
 def test_plan_tells_how_many_poses_are_tried_and_exchanged(monkeypatch, run):

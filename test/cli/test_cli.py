@@ -211,7 +211,7 @@ def test_a_calibration_that_is_not_accepted_keeps_the_earlier_one_aside(run, wri
     arguments = ('identify', '--csv', worse, '--chain', 'ur5e', '--out', out, '--force')
     status, said, _ = run(*arguments)
     assert status == Status.NOT_ACCEPTED == 3
-    assert 'Not accepted' in said
+    assert 'Nothing to correct' in said
     assert (out / 'calibration.previous.yaml').read_bytes() == accepted
     there = {path.name for path in out.iterdir()}
     assert there == {*RESULT_FILES, 'calibration.previous.yaml'} - {'calibration.yaml'}
