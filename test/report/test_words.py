@@ -99,6 +99,7 @@ def test_a_held_out_gross_error_is_counted_where_the_figures_are(unsearched):
     count = result.validation.figures[1].count
     said = f'{count + 1} held-out poses, 1 of them an outlier not in the figures'
     assert result.validated_by == said
+    assert '1 outlier, listed below' in str(report_of(problem, result).verdict.text)
     problem.sets[0].positions[3] += 0.02
     folded = identify(replace(problem, held_out=None))
     assert folded.validated_by.endswith(' poses, 1 of them an outlier not in the figures')
