@@ -22,6 +22,7 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.columns import Columns, cell_number
 from calib_ros.files.conventions import to_our_columns
 from calib_ros.files.headers import (
+    TURNS_LEFT,
     listed,
     name_and_unit,
     named_by_option,
@@ -37,6 +38,7 @@ from calib_ros.files.units import Units
 from calib_ros.files.vocabulary import (
     IN_TURN,
     JOINT,
+    MATRIX,
     MEASURED_COLUMNS,
     NUMBERS,
     POSITION,
@@ -178,6 +180,7 @@ class _Table:
             self._refuse_partial(chain)
         self._refuse_nominal(named)
         self._used = {name for each in self._columns.values() for name in each.names}
+        self._leave_turns(named)
 
     def _asked(self, asked: Mapping[str, Expression], optional: set[str]) -> dict[str, Expression]:
         """Return the expressions whose columns are there; others must be optional."""
@@ -229,6 +232,15 @@ class _Table:
         if guessed:
             self.notes.append(f'by their names, {", ".join(guessed.values())}')
         return kept
+
+    def _leave_turns(self, named: Mapping[str, Expression]) -> None:
+        """Leave out rx, ry, rz taken by our names if nobody told what they are, with a note."""
+        told = self._layout.euler or self._layout.rotation_vector or self._layout.inverse
+        others = {*QUATERNION, *MATRIX} & {*self._columns}
+        if not (told or others) and {*TURNS} <= {*named} and {*POSITION} <= {*self._columns}:
+            left = {*TURNS, *SIGMAS[3:]} & {*named}
+            self._columns = {n: each for n, each in self._columns.items() if n not in left}
+            self.notes.append(TURNS_LEFT)
 
     def _refuse_nominal(self, named: Mapping[str, Expression]) -> None:
         """Refuse columns taken by our names if they may be nominal ones."""

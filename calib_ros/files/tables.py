@@ -21,7 +21,7 @@ from calib_ros.errors import ColumnsError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import Codes, Columns, columns_of
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.headers import joints_left_out, name_and_unit, not_read
+from calib_ros.files.headers import TURNS_LEFT, joints_left_out, name_and_unit, not_read
 from calib_ros.files.journal import columns, of_journal
 from calib_ros.files.measurements import Measurements, distinct_rows, measurements
 from calib_ros.files.names import in_doubt, like_joints, option, quaternions_in, turns_in
@@ -95,10 +95,7 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
     notes += (*skipped, *joints_left_out(path, found.header, joints))
     if QUATERNION[0] not in cells:
         if {*TURNS} <= {*cells}:
-            turns = ', '.join(TURNS)
-            notes.append(
-                f'{path}: {turns} are left out: give --euler or --rotation-vector to use them'
-            )
+            notes.append(f'{path}: {TURNS_LEFT}')
         notes += turns_in(path, [name_and_unit(name)[0] for name in found.header])
     known = {*columns(joints), *TURNS, 'plane', f'q{joints + 1}'}
     return kept, (*notes, *not_read(path, [name for name in cells if name not in known]))

@@ -11,7 +11,7 @@ from calib_ros import load_chain, read_table
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, layout_of, load_layout
-from calib_ros.files.vocabulary import SIGMAS
+from calib_ros.files.vocabulary import SIGMAS, TURNS
 
 JOINTS = np.array([[0.1, -0.2], [0.3, 0.4], [-1.5, 2.0]])
 PLACES = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 0.125], [0.0, -1.0, 1e-3]])
@@ -281,6 +281,18 @@ def test_rows_in_which_nothing_was_measured_are_left_out_and_said(read):
     assert 'line 5: skipped' in ' '.join(table.warnings)
 
 
+def test_angles_of_unknown_form_are_left_out_with_units_given_too(read):
+    """The units that a message advises led to a refusal."""
+    for more in ('', ',srx,sry,srz'):
+        row = '57.29577951308232,2,4000,5000,6000,90,0,0' + ',1' * more.count(',')
+        text = f'q1,q2,x,y,z,rx,ry,rz{more}\n{row}\n'
+        table = read(text, length='mm', joint_angle='deg', insisted=('length', 'joint_angle'))
+        assert table.fitted[0].positions.tolist() == [[4.0, 5.0, 6.0]]
+        assert table.fitted[0].joints[0, 0] == pytest.approx(1.0)
+        assert not table.fitted[0].oriented.any()
+        assert any('rx, ry, rz are left out: give --euler' in each for each in table.warnings)
+
+
 def test_joint_values_that_stand_a_row_below(read):
     joints = np.vstack([[[9.0, 9.0]], JOINTS])
     places = np.vstack([PLACES, [[9.0, 9.0, 9.0]]])
@@ -298,7 +310,8 @@ def test_joint_values_that_stand_a_row_below(read):
         ('a,b,a,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'a'}}, 'comes 2 times: name it by its'),
         ('q1,q2,x,y,z,split,split\n1,2,3,4,5,,test\n', {}, 'split" comes 2 times'),
         (PLAIN, {'columns': {'x': '#9'}}, 'has no column #9 for x'),
-        (DEGREES.replace('90', '1'), {}, 'say which, --euler'),
+        (DEGREES, {'columns': dict(zip(TURNS, TURNS, strict=True))}, 'in degrees, .*--angle deg'),
+        (DEGREES.replace('90', '1'), {'inverse': True}, 'say which, --euler'),
         ('q1,q2,x,y,z,qx,qy,qz,qw\n1,2,3,4,5,0,0,0,2\n', {}, 'line 2: quaternion'),
         ('q1,q2,x,y,z\n', {}, 'no rows'),
         ('', {}, 'no rows'),
