@@ -14,7 +14,6 @@ from typing import Any
 from calib_ros.cli import common, inputs
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import GOOD_OR_BAD, Screen
-from calib_ros.decision.changes import reason_in_words
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
@@ -32,10 +31,10 @@ from calib_ros.identification.recalibration import recalibrate
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of
-from calib_ros.report import documents, reports, words
+from calib_ros.report import applied, documents, reports, words
 from calib_ros.report.advice import BRINGS, FAR, Advice
 from calib_ros.report.page import Origin, markdown
-from calib_ros.report.poses import poses_of
+from calib_ros.report.poses import poses_of, poses_to_verify
 from calib_ros.sampling.dataset import with_lenses
 from calib_ros.settings import Settings
 from calib_ros.shown import of_them, rounded
@@ -44,8 +43,7 @@ from calib_ros.texts import dump_json
 PAGES = ('report.html', 'report.md', 'residuals.csv', 'before_after.png')
 RESULT_FILES = ('calibration.yaml', 'result.json', 'settings.yaml', *PAGES)
 REPORTS = (*PAGES, 'report.pdf')
-STAYS = 'the arm is unchanged within the uncertainty: the correction that it has stays valid'
-NOT_OF_UPDATES = ('history', 'tolerance', 'pdf', 'model', 'fixed', 'priors', 'folds')
+NOT_OF_UPDATES = ('history', 'tolerance', 'model', 'fixed', 'priors', 'folds')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -104,11 +102,8 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
             found = recalibrate(previous, problem, years, growth, new)
         figures = documents.figures_document(found.comparison)
         text = dump_json(found.document() | figures) + '\n'
-        contents['result.json'] = text
-        if found.accepted:
-            contents['calibration.yaml'] = found.calibration.dump()
-        elif options.out is not None:
-            contents |= _set_aside(options.out, options.previous)
+        if options.out is not None:
+            contents |= _update_files(found, loaded, options, screen) | {'result.json': text}
     if options.json:
         screen.data(text)
     else:
@@ -118,33 +113,40 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
     return 0 if found.accepted else common.Status.NOT_ACCEPTED
 
 
+def _update_files(
+    found: Recalibration, loaded: Loaded, options: argparse.Namespace, screen: Screen
+) -> common.Contents:
+    """Return the report of an update, and its calibration or that which stays, with its own."""
+    contents: common.Contents = {'calibration.yaml': found.calibration.dump()}
+    if not found.accepted:
+        contents = {**_set_aside(options.out, options.previous)}
+        if 'calibration.yaml' in contents:
+            return contents
+    read = (options.csv, options.detections, options.measured, calibration_file(options.previous))
+    sets, arm = loaded.problem.all_sets, found.calibration.chain
+    poses = poses_to_verify(arm, sets, found.comparison, loaded.by_line)
+    origin = inputs.origin_of(options, read)
+    report = applied.update_report(found, poses, origin, loaded.warnings)
+    contents |= {'residuals.csv': poses.table(), 'report.md': markdown(report, {})}
+    return contents | inputs.page_of(report, screen, pdf=options.pdf)
+
+
 def _show_update(found: Recalibration, screen: Screen) -> None:
-    if found.accepted:
-        screen.title('Accepted: the calibration is brought up to date', True)
-    else:
-        screen.title('Not accepted: the earlier calibration stays as it was', False)
-    known = f'{1e3 * found.known_before:.3f} -> {1e3 * found.known_after:.3f} mm'
+    state, changed, step = applied.update_standing(found)
+    screen.title(state.heading, found.accepted)
     screen.table(
         {
             'robot': found.calibration.chain.name,
             'new poses': f'{found.after.count}, each judged by the others',
             'position error': words.rms_change((found.before, found.after)),
             '95 % interval': _intervals(found.comparison),
-            'arm known to': f'{known} over the joint range (one sigma)',
+            'arm known to': applied.known_to(found),
         }
     )
-    why, step = found.refusal()
-    if why:
+    for why in state.text:
         screen.bullet(why, (step,))
-    if found.accepted or not (found.determined or found.odd):
-        perhaps = 'perhaps ' if why else ''
-        for reasons in found.changed:
-            screen.bullet(perhaps + reason_in_words(reasons))
-    if found.accepted:
-        names = (name for reasons in found.changed for each in reasons for name in each.names)
-        same = all(map(found.calibration.chain.owns_frame, names))
-        unchanged = f'{reports.NOT_YET}: {reports.bring(found.calibration)}'
-        screen.bullet(STAYS if same else unchanged)
+    for each in (*changed, *[step] * found.accepted):
+        screen.bullet(each)
 
 
 def _intervals(judged: Comparison | None) -> str:

@@ -343,7 +343,7 @@ def load_calibration(path: str | os.PathLike[str], nominal: Chain | None = None)
     """
     file = calibration_file(path)
     if not file.exists():
-        names = 'report.html', 'result.json'  # updates have no report
+        names = 'report.html', 'result.json'  # without jinja2 no report
         other = next(filter(Path.exists, map(file.with_name, names)), None)
         if other is not None and file.name == 'calibration.yaml':
             raise ConfigError(

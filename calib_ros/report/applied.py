@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The pages of a workspace and of a plan."""
+"""The pages of a workspace, of a plan, and of a calibration brought up to date."""
 
 from __future__ import annotations
 
@@ -11,16 +11,22 @@ import numpy as np
 
 from calib_ros.apply.planning import Plan
 from calib_ros.apply.workspace import Placements, Survey, in_base, regions, spread
+from calib_ros.decision.changes import reason_in_words
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, sections
+from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Headline, Origin, Report, Section, section
-from calib_ros.report.poses import numbers, unit_of
+from calib_ros.report.poses import Poses, numbers, unit_of
+from calib_ros.report.reports import NOT_YET, bring
 from calib_ros.shown import rounded, sentence
 
 BEYOND = 'To use the calibration beyond the measured poses, measure there too.'
+STAYS = 'the arm is unchanged within the uncertainty: the correction that it has stays valid'
+PREDICTED = '"Before": by the earlier calibration; "after": predicted from the other new poses.'
 PLACE = 'To find the best place for a task: calib_ros workspace with --task FILE.'
 
 
@@ -198,4 +204,50 @@ def _listed(chain: Chain, joints: FloatArray) -> Section:
             (str(k + 1), *(f'{s[0] * q:.{s[2]}f}' for s, q in zip(show, row, strict=True)))
             for k, row in enumerate(joints[:200].tolist())
         ),
+    )
+
+
+def update_standing(found: Recalibration) -> tuple[Headline, tuple[str, ...], str]:
+    """Return the verdict on an update and why, what has changed, and what to do."""
+    why, step = found.refusal()
+    if found.accepted:
+        names = (name for reasons in found.changed for each in reasons for name in each.names)
+        same = all(map(found.calibration.chain.owns_frame, names))
+        step = STAYS if same else f'{NOT_YET}: {bring(found.calibration)}'
+    heading = 'Accepted: the calibration is brought up to date'
+    if not found.accepted:
+        heading = 'Not accepted: the earlier calibration stays as it was'
+    perhaps, told = 'perhaps ' * bool(why), found.accepted or not (found.determined or found.odd)
+    changed = tuple(perhaps + reason_in_words(each) for each in found.changed if told)
+    text = (why,) if why else ()
+    return Headline('good' if found.accepted else 'bad', heading, text), changed, step
+
+
+def known_to(found: Recalibration) -> str:
+    """Return how well the arm was and is known."""
+    known = f'{1e3 * found.known_before:.3f} -> {1e3 * found.known_after:.3f} mm'
+    return f'{known} over the joint range (one sigma)'
+
+
+def update_report(
+    found: Recalibration, poses: Poses, origin: Origin, warnings: Sequence[str] = ()
+) -> Report:
+    """Return the report of an earlier calibration and new poses."""
+    (state, changed, step), arm = update_standing(found), found.calibration.chain
+    known, corrected = ('Arm known to', known_to(found)), table_hash(arm) * found.accepted
+    text = tuple(map(sentence, (*state.text, *changed)))
+    return Report(
+        kind='Update of a calibration with a few poses',
+        robot=arm.name,
+        verdict=replace(state, text=text, gain=sections.gain(found.comparison)),
+        accuracy=sections.accuracy_section(
+            'Accuracy before and after', found.comparison, poses.things, PREDICTED
+        ),
+        picture=sections.distribution(poses),
+        steps=(sentence(step),),
+        remarks=tuple(map(sentence, warnings)),
+        identity=sections.identity_of(arm, origin, poses, [known], corrected),
+        explorer=explorer(arm, poses),
+        sections=(sections.coverage(arm, poses.joints, 'How far each joint was moved'),),
+        origin=origin,
     )

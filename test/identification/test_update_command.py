@@ -32,6 +32,12 @@ def test_the_command_writes_the_calibration_brought_up_to_date(earlier, run, tmp
     status, said, _ = run(*given, 'earlier.yaml', '--out', 'out')
     assert status == 0
     assert 'elbow_joint.theta by +0.' in said
+    for name in ('report.html', 'report.md'):
+        page = (tmp_path / 'out' / name).read_text()
+        assert 'The calibration is brought up to date'.lower() in page.lower()
+        assert 'elbow' in page
+        assert 'RMS position error' in page
+    assert len((tmp_path / 'out' / 'residuals.csv').read_text().splitlines()) == 9
     document = json.loads((tmp_path / 'out' / 'result.json').read_text())
     assert document['changed'][0][0]['owner'] == 'elbow_joint'
     text = (tmp_path / 'out' / 'calibration.yaml').read_text()
@@ -45,8 +51,9 @@ def test_the_command_writes_the_calibration_brought_up_to_date(earlier, run, tmp
     assert status == 3
     assert 'The calibration was fitted to these measurements' in ' '.join(said.split())
     assert not (tmp_path / 'again' / 'calibration.yaml').exists()
+    assert 'fitted to these measurements' in (tmp_path / 'again' / 'report.md').read_text()
     status, _, told = run(*given, 'again')
-    assert (status, 'again/result.json says why' in told) == (1, True)
+    assert (status, 'again/report.html says why' in told) == (1, True)
     # over what it brings up to date, which is that of the next night too
     (tmp_path / 'out' / 'report.html').write_text('of what stays')
     assert run(*given, 'out', '--out', 'out', '--force')[0] == 3
@@ -80,14 +87,16 @@ def test_no_report_of_the_earlier_calibration_stays_beside_its_update(earlier, r
     true, previous = earlier
     (tmp_path / 'out').mkdir()
     (tmp_path / 'out' / 'calibration.yaml').write_text(previous.dump())
-    for name in ('report.html', 'report.pdf', 'residuals.csv', 'my.txt'):
+    earlier_files = ('report.html', 'report.pdf', 'residuals.csv', 'before_after.png', 'my.txt')
+    for name in earlier_files:
         (tmp_path / 'out' / name).write_text('of the earlier one')
     write_csv(tmp_path / 'few.csv', rows_of(problem(true, 8, 1).observations, 0))
     given = ['identify', 'few.csv', '--chain', 'ur10e', '--sigma-position', '5e-5']
     given += ['--sigma-orientation', '2e-4', '--previous', 'out', '--out', 'out', '--force']
     assert run(*given)[0] == 0
-    found = {each.name for each in (tmp_path / 'out').iterdir()}
-    assert found == {'calibration.yaml', 'result.json', 'my.txt'}
+    found = {each.name: each.read_bytes() for each in (tmp_path / 'out').iterdir()}
+    assert {'calibration.yaml', 'result.json', 'report.html', 'residuals.csv'} < found.keys()
+    assert [name for name, text in found.items() if text == b'of the earlier one'] == ['my.txt']
 
 
 def test_the_calibration_of_another_serial_number_is_not_brought_up_to_date(
