@@ -281,6 +281,8 @@ def progress(
     told = counted(len(fitted), 'pose')
     if estimate is not None and estimate.astray(settings.largest_error):
         apart = f'{1e3 * estimate.rms:.0f} mm from where the joints are'
+        if not estimate.excess or estimate.rms <= settings.largest_error:
+            apart = 'which do not fit this arm'
         told += f', {apart}: check units, clocks and chain'
     elif estimate is not None:
         told += f', {1e3 * estimate.sigma:.3f} mm expected, {_forecast(estimate, settings)}'

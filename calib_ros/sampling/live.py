@@ -60,6 +60,7 @@ class Estimate:
     samples: int
     sigma: float  # RMS standard deviation [m] of positions over the joint range
     noise: float  # of the residuals, used for sigma [sigma given]
+    misfit: float  # the same noise, of positions [m]: beyond the arm's own if its parameters are
     rms: float  # of position residuals [m]
     excess: float | None
 
@@ -68,8 +69,8 @@ class Estimate:
         return self.excess is not None and self.sigma <= wanted
 
     def astray(self, largest_error: float) -> bool:
-        """Tell whether position residuals are further off than any arm [m]."""
-        return bool(self.excess) and self.rms > largest_error
+        """Tell whether positions, or what would explain them, are further off than any arm [m]."""
+        return max(self.misfit, self.rms if self.excess else 0.0) > largest_error
 
     def more_for(self, wanted: float) -> int:
         """Return how many more samples are expected for a wanted sigma [m]."""
@@ -144,7 +145,7 @@ def _fitted(problem: Problem, samples: Sequence[Sample], count: int) -> Update:
     out = [some[~near] for some, near in zip(members, good, strict=True)]
     gross = np.sort(np.concatenate(out)).tolist()
     spreads = np.array([each.spread for each in samples])
-    rms, ratio = _rms_residuals(
+    rms, ratio, given = _rms_residuals(
         chain, problem.sets, [spreads[some] for some in members], good, sigmas[0]
     )
     estimate = Estimate(
@@ -154,6 +155,7 @@ def _fitted(problem: Problem, samples: Sequence[Sample], count: int) -> Update:
         samples=round(kept.count / share),
         sigma=float(np.sqrt(variance.mean())),
         noise=float(np.sqrt(noise)),
+        misfit=float(np.sqrt(noise)) * given,
         rms=rms,
         excess=ratio if spare > len(names) else None,
     )
@@ -181,19 +183,20 @@ def _rms_residuals(
     spreads: Sequence[FloatArray],
     good: Sequence[Flags],
     sigma: float,
-) -> tuple[float, float]:
-    """Return the RMS position residual [m], and in units of the measurement scatter."""
-    squares, ratios = [], []
+) -> tuple[float, float, float]:
+    """Return the RMS position residual [m], in units of the scatter, and the sigma given [m]."""
+    squares, ratios, given = [], [], []
     for each, spread, near in zip(sets, spreads, good, strict=True):
         left = residual_arrays(chain, each)[0]
         scatter = np.full(len(each), sigma**2)
         if each.covariance is not None:
             own = np.trace(each.covariance[:, :3, :3], axis1=1, axis2=2) / 3.0
             scatter = np.where(np.isnan(own), scatter, own)
+        given.append(scatter[near])
         squares.append((left**2).sum(axis=1)[near])
         ratios.append(((left**2).mean(axis=1) / np.maximum(scatter, spread**2))[near])
-    first, second = (np.concatenate(found).mean() for found in (squares, ratios))
-    return math.sqrt(first), math.sqrt(second)
+    first, second, third = (np.concatenate(each).mean() for each in (squares, ratios, given))
+    return math.sqrt(first), math.sqrt(second), math.sqrt(third)
 
 
 def barely_moved(chain: Chain, joints: FloatArray) -> tuple[str, ...]:

@@ -109,6 +109,16 @@ def test_no_accuracy_is_expected_of_positions_in_millimetres():
     assert 'expected' not in made.status()
 
 
+@pytest.mark.parametrize('count', [6, 9, 10, 11, 12])
+def test_positions_in_millimetres_are_told_however_few_they_are(count):
+    """ "2717202 mm expected": they were explained by lengths of which no arm is."""
+    made = session([replace(each, position=1e3 * each.position) for each in samples(count)])
+    assert f'{count} poses, which do not fit this arm: check units' in made.status()
+    assert made.doubtful
+    assert 'expected' not in made.status()
+    assert 'expected' in session(samples(count)).status()
+
+
 def test_the_status_tells_of_measurements_only_between_the_stops():
     """By half a second apart, the clocks left each stop without a measurement, in silence."""
     made, motion = session(), stops(UR5E.random_joints(8, np.random.default_rng(1)))
