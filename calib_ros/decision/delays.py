@@ -17,6 +17,7 @@ import numpy as np
 
 from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import EXPLAINED
+from calib_ros.estimation.gain import gain_share
 from calib_ros.estimation.leastsquares import stacked
 from calib_ros.estimation.levels import TELLING
 from calib_ros.estimation.observations import Observations
@@ -81,18 +82,9 @@ def _explained(
     few = [replace(s, approach=None if s.velocity is None else rate(s.velocity)) for s in few]
     chain = result.chain.with_effects(lags)
     rows = problem.system(few).rows_of(chain, [*result.names, *lags])
-    added = [
-        np.einsum('knl,lcn->kcn', modes(each), part[count:-1])
-        for each, part in zip(few, rows, strict=True)
-    ]
-    parts = zip(rows, added, strict=True)
-    matrix = stacked([np.concatenate([part[:count], more, part[-1:]]) for part, more in parts])
-    known, wanted = matrix[:, :-1], matrix[:, -1]
-    if len(matrix) - known.shape[1] < len(matrix) // 3:
-        return 0.0, np.zeros(len(lags)), np.zeros(len(lags))
-    sizes = np.linalg.lstsq(known, wanted)[0]
-    alone = wanted - known[:, :count] @ np.linalg.lstsq(known[:, :count], wanted)[0]
-    left = wanted - known @ sizes
-    share = 1.0 - float(left @ left) / max(float(alone @ alone), 1e-300)
-    delays = np.asarray(sizes[count:])
-    return share, delays, np.abs(delays) * norms(known[:, count:].T)
+    for k, each in enumerate(few):
+        added = np.einsum('knl,lcn->kcn', modes(each), rows[k][count:-1])
+        rows[k] = np.concatenate([rows[k][:count], added, rows[k][-1:]])
+    matrix = stacked(rows)
+    delays = np.asarray(np.linalg.lstsq(matrix[:, :-1], matrix[:, -1])[0][count:])
+    return gain_share(matrix, count), delays, np.abs(delays) * norms(matrix[:, count:-1].T)

@@ -17,7 +17,7 @@ from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.gain import gain_of
+from calib_ros.estimation.gain import gain_share
 from calib_ros.estimation.leastsquares import stacked
 from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING
 from calib_ros.estimation.observations import Observations, numbered
@@ -123,11 +123,8 @@ def explained_share(
 ) -> float:
     """Return the share of the residual squares that added parameters explain, linearly."""
     few = [each.spread() for each in problem.sets]
-    rows = stacked(problem.system(few).rows_of(chain, (*fitted, *added)))
-    if len(rows) - len(fitted) - len(added) < len(rows) // 3:
-        return 0.0
-    gain, _, left = gain_of(rows.T @ rows, len(fitted))
-    return gain / left if left > 0.0 else 0.0
+    rows = problem.system(few).rows_of(chain, (*fitted, *added))
+    return gain_share(stacked(rows), len(fitted))
 
 
 def zero_of_distances(fitted: Fitted) -> tuple[Reason, ...]:

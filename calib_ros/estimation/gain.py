@@ -34,3 +34,14 @@ def gain_of(products: FloatArray, count: int) -> tuple[float, int, float]:
     root = inverse_root(left[:-1, :-1], sizes[count:-1])
     along = root.T @ left[:-1, -1]
     return float(along @ along), int(root.any(axis=0).sum()), float(left[-1, -1])
+
+
+def gain_share(rows: FloatArray, count: int) -> float:
+    """Return the share of the squares beside the first `count` columns that added ones explain.
+
+    The residual is the last column of the rows (R, P). Few rows tell none.
+    """
+    if len(rows) - rows.shape[1] + 1 < len(rows) // 3:
+        return 0.0
+    gain, _, left = gain_of(rows.T @ rows, count)
+    return gain / left if left > 0.0 else 0.0
