@@ -127,7 +127,7 @@ def _sessions(problem: Problem, result: Identification) -> str:
     worst = 0.0
     for first, *more in (map(Observations.some_images, s) for s in sessions):
         try:
-            alone = fit(replace(problem, observations=first, more=more, held_out=()))[2]
+            alone = fit(replace(problem, observations=first, more=more, held_out=()))
         except (CalibrationError, np.linalg.LinAlgError):
             return ''  # too few to tell, or without what an effect needs
         worst = max(worst, alone.noise.position)
@@ -361,7 +361,7 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
 def _imitated(freed: Problem, result: Identification) -> bool:
     """Tell whether a fit with more freedom finds another arm, within the region of this one."""
     try:
-        other = fit(freed)[2].chain
+        other = fit(freed).chain
     except (InputError, np.linalg.LinAlgError):
         return True
     joints = [each.spread().joints for each in freed.sets]

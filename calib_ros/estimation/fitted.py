@@ -71,6 +71,8 @@ class Fitted:
     """
 
     problem: Problem
+    structural: tuple[str, ...]  # identifiable names, wherever the poses are
+    start: Chain  # with start frames
     names: tuple[str, ...]
     robust: Robust
     factor: FloatArray
@@ -104,7 +106,7 @@ class Fitted:
 
 
 def parameter_rows(
-    fitted: Fitted, structural: Sequence[str], uncertainty: identifiability.Uncertainty
+    fitted: Fitted, uncertainty: identifiability.Uncertainty
 ) -> tuple[ParameterRow, ...]:
     """Return every parameter of a fitted chain, with its standard deviation if fitted."""
     problem, chain, names = fitted.problem, fitted.chain, fitted.names
@@ -117,7 +119,7 @@ def parameter_rows(
     for name in problem.model.parameter_names:
         if name in std:
             status = 'fitted'
-        elif name in structural:
+        elif name in fitted.structural:
             status = 'not excited'
         else:
             status = 'gauge' if name in free else 'fixed'

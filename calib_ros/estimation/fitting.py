@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -36,20 +37,16 @@ FOLLOWED = 2.0
 (benchmarks/real_robots.py)."""
 
 
-def fit(
-    problem: Problem, simpler: SimplerFit | None = None
-) -> tuple[tuple[str, ...], Chain, Fitted]:
-    """Return the structurally identifiable names, the chain with start frames, and the fit."""
+def fit(problem: Problem, simpler: SimplerFit | None = None) -> Fitted:
+    """Fit what the poses determine."""
     model, separations = problem.model, System((), None, (*problem.separations,)).separation_rows
     structural, held = identifiability.identifiable_and_held(
         model, problem.free, problem.kinds, separations
     )
     _require_enough(problem, [name for name in structural if name not in problem.prior_sigmas])
-    start = start_frames(problem)
-    names, factor = _excited_names(problem, structural, start)
-    fitted = _fit_all(problem, names, start, factor, simpler)
-    held = tuple(name for name in held if name not in names)  # unless a prior tells them
-    return structural, start, _widened(fitted, held) if held else fitted
+    fitted = _fit_all(problem, structural, start_frames(problem), simpler)
+    held = tuple(name for name in held if name not in fitted.names)  # unless a prior tells them
+    return _widened(fitted, held) if held else fitted
 
 
 def _widened(fitted: Fitted, held: tuple[str, ...]) -> Fitted:
@@ -79,16 +76,11 @@ def _excited_names(
 
 
 def _fit_all(
-    problem: Problem,
-    names: tuple[str, ...],
-    start: Chain,
-    factor: FloatArray,
-    simpler: SimplerFit | None,
+    problem: Problem, structural: tuple[str, ...], start: Chain, simpler: SimplerFit | None
 ) -> Fitted:
-    """Fit the named parameters from start frames, with priors where needed.
-
-    `factor` (P, P) is that of some samples at the start.
-    """
+    """Fit what the poses determine from start frames, with priors where needed."""
+    names, factor = _excited_names(problem, structural, start)
+    fit_from = partial(_fit, structural, start, names)
     problem = _guarded(problem, names, factor, simpler)
     rough = start
     if simpler is not None:
@@ -96,11 +88,11 @@ def _fit_all(
     few = problem.system([each.spread(SOME) for each in problem.sets])
     if few.count < sum(map(len, problem.sets)) // 2:
         rough = minimise(rough, names, few, tolerance=1e-2).chain
-    fitted = _fit(*_thin_problem(problem, simpler), rough, names)
+    fitted = fit_from(rough, *_thin_problem(problem, simpler))
     guarded = _guarded(problem, names, fitted.factor, simpler)
     if guarded is not problem:  # outliers carried the information
         problem = guarded
-        fitted = _fit(*_thin_problem(problem, simpler), rough, names)
+        fitted = fit_from(rough, *_thin_problem(problem, simpler))
     size, first = _noise_for_priors(fitted.noise, simpler), fitted.size
     if simpler is None and (fitted.noise.consistent or size <= 1.0):
         size = min(size, _likely_noise(fitted))
@@ -115,7 +107,7 @@ def _fit_all(
             if not problem.model.owns_frame(name)
         }
         problem = replace(problem, learned=Learned(priors, size))
-        fitted = _fit(problem, simpler, fitted.chain, names, again=True)
+        fitted = fit_from(fitted.chain, problem, simpler, again=True)
         less = _noise_for_priors(fitted.noise, simpler)
         if simpler is None or SUSPICIOUS * less > size:
             break
@@ -137,10 +129,12 @@ def _thin_problem(
 
 
 def _fit(
+    structural: tuple[str, ...],
+    start: Chain,
+    names: tuple[str, ...],
+    chain: Chain,
     problem: Problem,
     simpler: SimplerFit | None,
-    chain: Chain,
-    names: tuple[str, ...],
     again: bool = False,
 ) -> Fitted:
     """Fit the named parameters from a near chain, or `again` from a fitted one."""
@@ -154,7 +148,8 @@ def _fit(
     factor = factor_of(fit.chain, names, robust.system, fit.normal)
     noise, uncertainty = noise_of(fit, names, robust.system, factor)
     noise = replace(noise, given=problem.sigmas)
-    return Fitted(problem, names, robust, factor, noise, uncertainty, noise.size)
+    found = robust, factor, noise, uncertainty, noise.size
+    return Fitted(problem, structural, start, names, *found)
 
 
 def _noise_for_priors(noise: Noise, simpler: SimplerFit | None) -> float:

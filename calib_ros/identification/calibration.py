@@ -254,7 +254,7 @@ class Calibration(Shown):
         arm = tuple(name for name in chain.parameter_names if not chain.owns_frame(name))
         chain = released(chain, chain.frame_names)
         try:
-            _, _, fitted = fit(Problem(chain, sets[0], more=tuple(sets[1:]), fixed=arm))
+            fitted = fit(Problem(chain, sets[0], more=tuple(sets[1:]), fixed=arm))
         except InputError:  # too few for frames of their own
             return None
         found = find_step(fitted, held=True)

@@ -73,8 +73,9 @@ def _identified(
     problem: Problem, simpler: Identification | None, progress: Notify
 ) -> Identification:
     known = SimplerFit(simpler.chain, simpler.distances, simpler.noise) if simpler else None
-    structural, start, fitted = fit(problem, known)
+    fitted = fit(problem, known)
     problem, names, robust, chain = fitted.problem, fitted.names, fitted.robust, fitted.chain
+    start = fitted.start
     progress(1 / 2)  # with many poses (benchmarks/end_to_end.py)
     frames = [name for name in names if start.owns_frame(name)]
     if robust.system.count > 4 * SOME:
@@ -92,7 +93,7 @@ def _identified(
     unmodelled, moved = unmodelled_errors(posterior, fitted.factor, fitted.system)
     posterior = with_mixture(replace(posterior, unmodelled=unmodelled), fitted, size, more, doubts)
     uncertainty = fitted.uncertainty.with_part(moved).with_part(unmodelled.square)
-    parameters = parameter_rows(fitted, structural, uncertainty)
+    parameters = parameter_rows(fitted, uncertainty)
     region, scaled = _region(fitted, posterior, size, more, doubts)
     step = find_step(fitted)
     result = Identification(

@@ -168,7 +168,7 @@ def test_whether_rounding_explains_the_gain_is_an_f_test(rng, monkeypatch):
     q[:, 2] = 0.3 * level
     problem = Problem(UR10E, measure(true, q, rng, *NOISE), **SIGMAS)
     before = replace(UR10E, base=true.base, tool=true.tool)
-    fitted = fit(problem)[2]
+    fitted = fit(problem)
     rounding.may_be_rounding(fitted, before, {'elbow_joint': 1e-3})
     frames = [name for name in fitted.names if before.owns_frame(name)]
     assert not rounding.may_be_rounding(

@@ -133,7 +133,7 @@ def test_two_sessions_are_of_one_arm_unless_each_fits_far_better_alone(change, t
         if isinstance(size, Exception):
             raise size
         assert (*problem.more, *problem.held_out) == ()
-        return None, None, SimpleNamespace(noise=SimpleNamespace(position=size))
+        return SimpleNamespace(noise=SimpleNamespace(position=size))
 
     monkeypatch.setattr(plausibility, 'fit', fit)
     monkeypatch.setattr(plausibility.Observations, 'some_images', lambda each: each)

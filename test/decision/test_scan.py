@@ -29,7 +29,7 @@ def bumped(errors=1.0, size=1e-3, noise=NOISE, **more):
     late = np.arange(COUNT)[:, np.newaxis] >= AT
     along = true.forward(seen.joints)[:, :3, 0]
     seen = replace(seen, positions=seen.positions + size * late * along)
-    return fitting.fit(Problem(UR10E, seen, **SIGMAS, **more))[2]
+    return fitting.fit(Problem(UR10E, seen, **SIGMAS, **more))
 
 
 @pytest.mark.parametrize('count', [6, 30, 400])
@@ -54,7 +54,7 @@ def test_a_held_frame_that_does_not_explain_most_is_not_named(monkeypatch, rng):
     _, true, seen = measured_arm(rng, COUNT)
     matrix = true.base.matrix + 3e-3 * np.eye(4, k=3)
     chain = replace(UR10E, base=replace(true.base, matrix=matrix, fixed=True))
-    fitted = fitting.fit(Problem(chain, seen, **SIGMAS))[2]
+    fitted = fitting.fit(Problem(chain, seen, **SIGMAS))
     found = find_step(fitted)
     assert found.held
     monkeypatch.setattr(steps, 'EXPLAINED', found.share + 1e-6)
@@ -138,7 +138,7 @@ def test_another_load_from_the_first_pose_on_is_no_step_of_an_arm_that_is_held(h
     q = 0.1 * UR10E.random_joints(COUNT, rng)
     q[AT:, 1:3] += 1.5
     seen = measure(true, q, rng, *NOISE)
-    fitted = fitting.fit(Problem(UR10E, seen, fixed=('*_joint.*',), **SIGMAS))[2]
+    fitted = fitting.fit(Problem(UR10E, seen, fixed=('*_joint.*',), **SIGMAS))
     assert (find_step(fitted, held) is None) == held
 
 

@@ -171,7 +171,7 @@ def test_a_dozen_positions_show_a_bump_and_nothing_else():
         _, true, seen = measured_arm(seed, 12, oriented=False)
         assert identify(Problem(UR10E, seen, **SIGMAS)).step is None
         bumped = Problem(UR10E, moved(seen, true, 'tool', 5e-3, at=6), **SIGMAS)
-        assert abs(find_step(fitting.fit(bumped)[2]).sample - 6) <= 1
+        assert abs(find_step(fitting.fit(bumped)).sample - 6) <= 1
 
 
 @pytest.mark.parametrize(('slip', 'found'), [(0.0, None), (2e-3, UR10E.joint_names[2])])
@@ -312,7 +312,7 @@ def test_nothing_moves_between_fewer_stops_than_a_step_has_on_both_sides(stops, 
     true, few = arm(rng), np.repeat(UR10E.random_joints(stops, rng), 8, axis=0)
     seen = moved(measure(true, few, rng, *NOISE), true, 'tool', 0.02, at=32)
     problem = Problem(UR10E, seen, fixed=('*_joint.*',))
-    step = find_step(fitting.fit(problem)[2])
+    step = find_step(fitting.fit(problem))
     assert (step is not None and (step.kind, step.sample) == ('tool', 32)) == found
 
 

@@ -221,7 +221,7 @@ def test_the_expected_error_is_that_of_shift_and_covariance(rng):
 
 
 def test_a_fit_is_weighed_with_the_likeliest_sizes_alone():
-    _, _, fitted = fit(problem_of(arm(0), spread(0, count=10)))
+    fitted = fit(problem_of(arm(0), spread(0, count=10)))
     found = posterior_of(fitted, 2.0, judging=False)
     stds = np.array([found.priors.get(name, np.inf) for name in found.names])
     whole = fitted.products[:-1, :-1] / 2.0**2 + np.diag(stds**-2.0)

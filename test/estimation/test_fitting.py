@@ -137,8 +137,9 @@ def test_every_parameter_has_a_row_with_what_became_of_it():
     chain = UR10E.with_offsets({'elbow_joint.a': 2e-3})
     parts = np.array([np.diag([1.0, 4.0]), np.diag([0.0, 12.0])])
     uncertainty = Uncertainty(parts, np.array([10.0, np.inf]))
-    fitted = SimpleNamespace(problem=problem, chain=chain, names=names)
-    rows = parameter_rows(fitted, [*names, 'elbow_joint.theta'], uncertainty)
+    known = [*names, 'elbow_joint.theta']
+    fitted = SimpleNamespace(problem=problem, structural=known, chain=chain, names=names)
+    rows = parameter_rows(fitted, uncertainty)
     assert [row.name for row in rows] == list(chain.parameter_names)
     found = {row.name: row for row in rows}
     assert found['elbow_joint.a'].offset == pytest.approx(2e-3)
@@ -171,7 +172,7 @@ def test_parameters_that_some_poses_do_not_excite_may_be_by_all(count, monkeypat
 def test_noise_is_searched_as_far_as_the_sizes_of_errors():
     """Measurements without noise, at rounding, leave nothing to find."""
     _, _, exact = measured_arm(0, 8, noise=(0.0, 0.0))
-    _, _, found = fitting.fit(Problem(UR10E, exact, priors={'*_joint.*': 1e-2}))
+    found = fitting.fit(Problem(UR10E, exact, priors={'*_joint.*': 1e-2}))
     assert fitting._likely_noise(found) == LEAST_SIZE
 
 
@@ -182,5 +183,5 @@ def test_effects_larger_than_usual_are_fitted_as_large_as_they_are(seed):
     sizes = 5e-3 * rng.normal(size=len(names))
     true = arm(rng).with_effects(names).with_offsets(dict(zip(names, sizes, strict=True)))
     seen = measure(true, UR10E.random_joints(40, rng), rng, *NOISE)
-    *_, found = fitting.fit(Problem(UR10E.with_effects(names), seen, **SIGMAS))
+    found = fitting.fit(Problem(UR10E.with_effects(names), seen, **SIGMAS))
     assert rms(found.chain, true, UR10E.random_joints(200, rng)) < 1.5e-4

@@ -77,7 +77,7 @@ def test_a_prior_on_a_gauge_makes_it_fitted_with_its_own_deviation(rng):
 def test_the_posterior_of_given_priors_is_that_of_bayes(rng):
     """With noise twice that of the sigmas given."""
     *_, seen = measured_arm(rng, 20)
-    fitted = fit(Problem(UR10E, seen, priors=manufacture(), **SIGMAS))[2]
+    fitted = fit(Problem(UR10E, seen, priors=manufacture(), **SIGMAS))
     found = posterior_of(fitted, 2.0, judging=False)
     assert found.priors == pytest.approx(manufacture())
     precision = [found.priors.get(name, np.inf) ** -2 for name in fitted.names]
@@ -127,6 +127,6 @@ def test_sigmas_that_are_too_large_do_not_hold_few_poses_near_nominal():
         rng, true, seen = measured_arm(seed, 6)
         unseen = UR10E.random_joints(100, rng)
         told = [{name: times * sigma for name, sigma in SIGMAS.items()} for times in (1.0, 5.0)]
-        errors.append([rms(fit(Problem(UR10E, seen, **s))[2].chain, true, unseen) for s in told])
+        errors.append([rms(fit(Problem(UR10E, seen, **s)).chain, true, unseen) for s in told])
     known, coarse = np.sqrt(np.mean(np.square(errors), axis=0))
     assert coarse < 1.15 * known

@@ -134,7 +134,7 @@ def test_the_size_that_planes_do_not_tell_is_as_uncertain_as_lengths_are(seed):
 def test_what_planes_do_not_tell_is_held_and_uncertain(nominal, held):
     """Touches are met as well by other values of it, with what follows it."""
     _, sets = cell(2, nominal=nominal)
-    _, _, fitted = fit(Problem(nominal, sets[0], more=sets[1:], sigma_touch=SIGMA))
+    fitted = fit(Problem(nominal, sets[0], more=sets[1:], sigma_touch=SIGMA))
     names, slopes = fitted.held
     assert list(names) == held
     assert not {*names} & {*fitted.names}
