@@ -19,7 +19,7 @@ whose inverse has the mean (TAILS + (x^2 + V_ii) / s^2) / (TAILS - 1).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TypeAlias
 
@@ -140,70 +140,64 @@ class Posterior(Shown):
         return variance / self.priors[name] ** 2 if name in self.priors else 0.0
 
 
-def posterior_of(
-    fitted: Fitted,
-    noise: float,
-    more: Sequence[str] = (),
-    rounding: Mapping[str, float] | None = None,
-    judging: bool = True,
-) -> Posterior:
-    """Return the posterior of a fit and of `more` considered effects, linearised at the fit.
+@dataclass(frozen=True, eq=False)
+class Inference:
+    """What the posterior of a fit and of `more` considered effects follows from.
 
     Offsets from the nominal chain are normal about zero. The samples have their weights in the
-    fit, and noise of size `noise` [sigma given]. `rounding` are standard deviations of parameters
-    that rounded joint values move too. Plausible sizes and the device only count if `judging`.
+    fit, at which all is linear, and noise of size `noise` [sigma given]. `rounding` are standard
+    deviations of parameters that rounded joint values move too.
     """
-    columns = _Columns(fitted, noise, more, rounding)
-    evidence, arm, sums = columns.evidence(), columns.arm, columns.sums
-    size, slope = evidence.most_probable(columns.considered)
-    near = evidence.sigma_points(size, slope) if judging else []
-    usual = zip(columns.names, evidence.precision(size).tolist(), strict=False)
-    priors = {name: float(each**-0.5) for name, each in usual if each > 0.0}
-    if judging:
+
+    fitted: Fitted
+    noise: float
+    more: Sequence[str] = ()
+    rounding: Mapping[str, float] = field(default_factory=dict)
+
+    def likeliest(self) -> Posterior:
+        """Return the posterior of what is fitted, for the most probable sizes alone."""
+        columns = _Columns(self)
+        evidence = columns.evidence()
+        return columns.posterior(evidence, evidence.most_probable(columns.considered)[0])
+
+    def judging(self) -> Posterior:
+        """Return the posterior averaged over plausible sizes, with the device, to judge an arm."""
+        columns = _Columns(self)
+        evidence, sums = columns.evidence(), columns.sums
+        size, slope = evidence.most_probable(columns.considered)
+        near = evidence.sigma_points(size, slope)
+        found = columns.posterior(evidence, size)
         evidence.widen(size)
-    weights, tried = zip(*(near or [(1.0, size)]), strict=True)
-    alone, along = columns.about_nominal(sums.plain)
-    precisions = [evidence.precision(each)[arm] for each in tried]
-    each_alone = [solved(alone[arm, arm], along[arm], each) for each in precisions]
-    mean, covariance = mixed(each_alone, weights)
-    other = alone, sums.cross[:-1], sums.doubtful, evidence.precision(size), arm.stop
-    device = _device(*other) if judging else np.zeros((arm.stop, 0))
-    offsets = columns.offsets[arm]
-    found = offsets, mean - offsets, covariance, device, priors, evidence.named(size)
-    posterior = Posterior(columns.chain, columns.names, *found)
-    return posterior if fitted.held is None else posterior.held_at(*fitted.held)
+        shift, covariance = columns.averaged(evidence, near)
+        matrix, precision = columns.about_nominal(sums.plain)[0], evidence.precision(size)
+        device = _device(matrix, sums.cross[:-1], sums.doubtful, precision, columns.arm.stop)
+        found = replace(found, shift=shift, covariance=covariance, device=device)
+        return found if self.fitted.held is None else found.held_at(*self.fitted.held)
 
+    def with_mixture(self, posterior: Posterior) -> Posterior:
+        """Return its posterior with the arms that may have given the data.
 
-def with_mixture(
-    posterior: Posterior,
-    fitted: Fitted,
-    noise: float,
-    more: Sequence[str],
-    rounding: Mapping[str, float] | None = None,
-) -> Posterior:
-    """Return the posterior of the same arguments with the arms that may have given the data.
-
-    Its axes may wobble by the `unmodelled` waves, and the device may be out of scale.
-    """
-    columns = _Columns(fitted, noise, more, rounding, posterior.unmodelled.waves)
-    evidence, arm, considered = columns.evidence(), columns.arm, columns.considered
-    size, slope = evidence.most_probable(considered)
-    near = evidence.sigma_points(size, slope)
-    rival, scale, checked = None, 0.0, bool(fitted.problem.sigma_scale)
-    if columns.scaled and fitted.held is None and (checked or columns.scale < PRINTED):
-        elsewhere = columns.evidence(max(OUT_OF_SCALE, columns.scale))
-        odds, mean, covariance = elsewhere.odds_against(evidence, size, considered)
-        # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
-        odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
-        rival, scale = (odds, mean[arm], covariance[arm, arm]), float(mean[-1])
-    evidence.widen(size)
-    found = [(w, *solved(*columns.normal, evidence.precision(each))) for w, each in near]
-    mixture = [(w, mean[arm], root[arm] @ root[arm].T) for w, mean, root in found]
-    if fitted.held is not None:  # nothing measures the scale
-        mixture = [posterior.with_held(each, *fitted.held) for each in mixture]
-    elif columns.scaled and rival is None:
-        scale = float(found[0][1][-1])
-    return replace(posterior, mixture=tuple(mixture), rival=rival, scale=scale)
+        Its axes may wobble by the `unmodelled` waves, and the device may be out of scale.
+        """
+        columns, fitted = _Columns(self, posterior.unmodelled.waves), self.fitted
+        evidence, arm, considered = columns.evidence(), columns.arm, columns.considered
+        size, slope = evidence.most_probable(considered)
+        near = evidence.sigma_points(size, slope)
+        rival, scale, checked = None, 0.0, bool(fitted.problem.sigma_scale)
+        if columns.scaled and fitted.held is None and (checked or columns.scale < PRINTED):
+            elsewhere = columns.evidence(max(OUT_OF_SCALE, columns.scale))
+            odds, mean, covariance = elsewhere.odds_against(evidence, size, considered)
+            # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
+            odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
+            rival, scale = (odds, mean[arm], covariance[arm, arm]), float(mean[-1])
+        evidence.widen(size)
+        found = [(w, *solved(*columns.normal, evidence.precision(each))) for w, each in near]
+        mixture = [(w, mean[arm], root[arm] @ root[arm].T) for w, mean, root in found]
+        if fitted.held is not None:  # nothing measures the scale
+            mixture = [posterior.with_held(each, *fitted.held) for each in mixture]
+        elif columns.scaled and rival is None:
+            scale = float(found[0][1][-1])
+        return replace(posterior, mixture=tuple(mixture), rival=rival, scale=scale)
 
 
 class _Columns:
@@ -212,23 +206,17 @@ class _Columns:
     With the products of their rows for noise of a size.
     """
 
-    def __init__(
-        self,
-        fitted: Fitted,
-        noise: float,
-        more: Sequence[str],
-        rounding: Mapping[str, float] | None,
-        waves: float = 0.0,
-    ) -> None:
+    def __init__(self, given: Inference, waves: float = 0.0) -> None:
+        fitted, more = given.fitted, given.more
         problem, names, system = fitted.problem, fitted.names, fitted.system
         own = [n for n in more if not (Parameter(n).of_dh or problem.model.owns_frame(n))]
         self.names, self.chain = (*names, *more), fitted.chain.with_effects(own)
-        beside = {name: std for name, std in (rounding or {}).items() if name in names}
+        beside = {name: std for name, std in given.rounding.items() if name in names}
         whole, lengths, self.scale = self.chain, dict[str, float](), SCALE
         if more:
             whole, lengths, self.scale = lengths_of(self.chain, system)
         nuisances = Nuisances(beside, lengths, bool(more), Unmodelled(waves=waves), kept=True)
-        noise = max(noise, ROUNDING)  # parameters that follow all exactly leave none
+        noise = max(given.noise, ROUNDING)  # parameters that follow all exactly leave none
         self.sums = _sums_of(fitted, whole, self.names, nuisances, noise)
         self.scaled, count = bool(lengths), len(self.sums.plain) - 1
         self.arm = slice(0, count - self.scaled)  # with waves, in units of their size
@@ -249,6 +237,26 @@ class _Columns:
             checked = scale is None and self._checked
             groups, given = [*groups, None if checked else 'scale'], [*given, checked or np.inf]
         return Evidence(*self.normal, np.array(given) ** -2.0, groups, typical)
+
+    def posterior(self, evidence: Evidence, size: FloatArray) -> Posterior:
+        """Return the posterior for log sizes (G,), without the device."""
+        usual = zip(self.names, evidence.precision(size).tolist(), strict=False)
+        priors = {name: float(each**-0.5) for name, each in usual if each > 0.0}
+        shift, covariance = self.averaged(evidence, [(1.0, size)])
+        device, sizes = np.zeros((self.arm.stop, 0)), evidence.named(size)
+        found = self.offsets[self.arm], shift, covariance, device, priors, sizes
+        return Posterior(self.chain, self.names, *found)
+
+    def averaged(
+        self, evidence: Evidence, near: Sequence[tuple[float, FloatArray]]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the mean (P,) from the fit and the covariance (P, P), for weighted log sizes."""
+        weights, tried = zip(*near, strict=True)
+        matrix, vector = (each[self.arm] for each in self.about_nominal(self.sums.plain))
+        precisions = [evidence.precision(each)[self.arm] for each in tried]
+        each_alone = [solved(matrix[:, self.arm], vector, each) for each in precisions]
+        mean, covariance = mixed(each_alone, weights)
+        return mean - self.offsets[self.arm], covariance
 
     def about_nominal(self, products: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the normal equations (K, K), (K,) of all offsets from products of their rows."""

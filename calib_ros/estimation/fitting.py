@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation import identifiability
-from calib_ros.estimation.evidence import posterior_of
+from calib_ros.estimation.evidence import Inference
 from calib_ros.estimation.fitted import Fitted, SimplerFit
 from calib_ros.estimation.leastsquares import System, factor_of, minimise, triangular_factor
 from calib_ros.estimation.levels import CONFIDENT
@@ -54,7 +54,7 @@ def _widened(fitted: Fitted, held: tuple[str, ...]) -> Fitted:
     count = len(fitted.names)
     factor = factor_of(fitted.chain, (*fitted.names, *held), fitted.system)
     slopes = -solve_triangular(factor[:count, :count], factor[:count, count:])
-    stds = posterior_of(fitted, fitted.size, judging=False).stds_of(held)
+    stds = Inference(fitted, fitted.size).likeliest().stds_of(held)
     shared = (slopes * stds**2) @ slopes.T
     return replace(fitted, uncertainty=fitted.uncertainty.with_part(shared), held=(held, slopes))
 
@@ -96,7 +96,7 @@ def _fit_all(
     size, first = _noise_for_priors(fitted.noise, simpler), fitted.size
     if simpler is None and (fitted.noise.consistent or size <= 1.0):
         size = min(size, _likely_noise(fitted))
-    posterior = posterior_of(fitted, size, judging=False)
+    posterior = Inference(fitted, size).likeliest()
     told = (posterior.prior_share(n) <= 1.0 - CONFIDENT for n in names if n not in problem.given)
     if problem.learned is None and not problem.model.effects and all(told):
         return fitted  # the priors found would not change the fit
@@ -112,7 +112,7 @@ def _fit_all(
         if simpler is None or SUSPICIOUS * less > size:
             break
         size = less  # too narrow priors had made it larger
-        posterior = posterior_of(fitted, size, judging=False)
+        posterior = Inference(fitted, size).likeliest()
     return replace(fitted, size=first if simpler is None else min(first, less))
 
 
@@ -186,7 +186,7 @@ def _likely_noise(fitted: Fitted) -> float:
     sums, rows, shared, _ = squares_of(fitted.chain, fitted.system).sum(axis=1).tolist()
     width, size = np.log(SPREAD) ** -2, 1.0
     for _ in range(ROUNDS):
-        found = posterior_of(fitted, size, judging=False)
+        found = Inference(fitted, size).likeliest()
         along = np.append(-found.shift, 1.0)
         squares = float(along @ products @ along) / size**2
         free = rows - float(np.sum(products[:-1, :-1] * found.covariance)) / size**2

@@ -31,7 +31,7 @@ from calib_ros.errors import InputError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.considered import considered
-from calib_ros.estimation.evidence import Posterior, posterior_of, with_mixture
+from calib_ros.estimation.evidence import Inference, Posterior
 from calib_ros.estimation.fitted import Fitted, ParameterRow, SimplerFit, parameter_rows
 from calib_ros.estimation.fitting import SOME, fit
 from calib_ros.estimation.leastsquares import System, minimise, normal_equations
@@ -87,14 +87,14 @@ def _identified(
     validation, validated_by = validate(fitted, before.chain, explained)
     coarse = rounded_joints(problem)
     share = coupling_share(fitted)
-    size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
-    more = considered(chain, names, problem.fixed)
-    posterior = posterior_of(fitted, size, more, doubts)
+    more, doubts = considered(chain, names, problem.fixed), rounding_errors(problem, coarse)
+    inference = Inference(fitted, _size(fitted, share), more, doubts)
+    posterior = inference.judging()
     unmodelled, moved = unmodelled_errors(posterior, fitted.factor, fitted.system)
-    posterior = with_mixture(replace(posterior, unmodelled=unmodelled), fitted, size, more, doubts)
+    posterior = inference.with_mixture(replace(posterior, unmodelled=unmodelled))
     uncertainty = fitted.uncertainty.with_part(moved).with_part(unmodelled.square)
     parameters = parameter_rows(fitted, uncertainty)
-    region, scaled = _region(fitted, posterior, size, more, doubts)
+    region, scaled = _region(inference, posterior)
     step = find_step(fitted)
     result = Identification(
         chain=chain,
@@ -131,25 +131,17 @@ def _identified(
     return plausibility.add_remarks(problem, named, another=named is result)
 
 
-def _region(
-    fitted: Fitted,
-    posterior: Posterior,
-    size: float,
-    more: Sequence[str],
-    doubts: Mapping[str, float],
-) -> tuple[Region | None, float]:
-    """Return the region, and the error of the device's scale if that alone leaves none, or 0.
-
-    The posterior is that with `more` effects, `doubts` and noise of a `size`.
-    """
-    problem, freedom = fitted.problem, fitted.uncertainty.overall
+def _region(inference: Inference, posterior: Posterior) -> tuple[Region | None, float]:
+    """Return the region, and the error of the device's scale if that alone leaves none, or 0."""
+    fitted, problem = inference.fitted, inference.fitted.problem
+    freedom = fitted.uncertainty.overall
     of = partial(region_of, sets=problem.sets, freedom=freedom, largest=problem.largest_error)
     region = of(posterior)
     printed = all(each.pixels is not None for each in problem.sets)
     finer = SCALE if printed else EXCEPTION * SCALE  # as of a tracker
     if region is None and posterior.scale and not 0.0 < problem.sigma_scale <= finer:
         checked = replace(fitted, problem=replace(problem, sigma_scale=finer))
-        if of(with_mixture(posterior, checked, size, more, doubts)) is not None:
+        if of(replace(inference, fitted=checked).with_mixture(posterior)) is not None:
             return None, posterior.scale
     return region, 0.0
 

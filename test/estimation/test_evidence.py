@@ -11,7 +11,7 @@ from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.estimation import evidence
 from calib_ros.estimation.considered import considered
-from calib_ros.estimation.evidence import Posterior, _device, posterior_of, size_group
+from calib_ros.estimation.evidence import Inference, Posterior, _device, size_group
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.sizes import SPREAD, TYPICAL, Evidence
@@ -222,7 +222,7 @@ def test_the_expected_error_is_that_of_shift_and_covariance(rng):
 
 def test_a_fit_is_weighed_with_the_likeliest_sizes_alone():
     fitted = fit(problem_of(arm(0), spread(0, count=10)))
-    found = posterior_of(fitted, 2.0, judging=False)
+    found = Inference(fitted, 2.0).likeliest()
     stds = np.array([found.priors.get(name, np.inf) for name in found.names])
     whole = fitted.products[:-1, :-1] / 2.0**2 + np.diag(stds**-2.0)
     left = found.covariance @ whole - np.eye(len(whole))
@@ -275,4 +275,4 @@ def test_only_what_is_fitted_is_doubted(monkeypatch):
     names = ('base.x', 'elbow_joint.theta')
     fitted = SimpleNamespace(problem=problem, names=names, chain=UR10E, system=System(()))
     with pytest.raises(AskedError):
-        evidence.posterior_of(fitted, 2.0, rounding=rounding)
+        evidence.Inference(fitted, 2.0, rounding=rounding).judging()

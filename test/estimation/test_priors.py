@@ -10,7 +10,7 @@ from fits import SIGMAS, UR10E, measured_arm, rms
 
 from calib_ros.apply.simulation import Cell
 from calib_ros.errors import ConfigError, TooFewObservationsError, UnknownNameError
-from calib_ros.estimation.evidence import posterior_of
+from calib_ros.estimation.evidence import Inference
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.joint_errors import NOTHING
@@ -78,7 +78,7 @@ def test_the_posterior_of_given_priors_is_that_of_bayes(rng):
     """With noise twice that of the sigmas given."""
     *_, seen = measured_arm(rng, 20)
     fitted = fit(Problem(UR10E, seen, priors=manufacture(), **SIGMAS))
-    found = posterior_of(fitted, 2.0, judging=False)
+    found = Inference(fitted, 2.0).likeliest()
     assert found.priors == pytest.approx(manufacture())
     precision = [found.priors.get(name, np.inf) ** -2 for name in fitted.names]
     measured = fitted.products[:-1, :-1] / 4.0

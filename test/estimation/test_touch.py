@@ -16,7 +16,7 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation import start
 from calib_ros.estimation.considered import lengths_of
-from calib_ros.estimation.evidence import posterior_of
+from calib_ros.estimation.evidence import Inference
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import System, triangular_factor
 from calib_ros.estimation.levels import LARGEST_SCALE, PRINTED, SCALE
@@ -143,7 +143,7 @@ def test_what_planes_do_not_tell_is_held_and_uncertain(nominal, held):
     left = factor @ np.concatenate([slopes, np.eye(len(names))])
     alone = np.linalg.norm(factor[:, len(slopes) :], axis=0)
     assert (np.linalg.norm(left, axis=0) < 0.03 * alone).all()
-    stds = posterior_of(fitted, fitted.size, judging=False).stds_of(names)
+    stds = Inference(fitted, fitted.size).likeliest().stds_of(names)
     shared = sum(std**2 * np.outer(s, s) for std, s in zip(stds, slopes.T, strict=True))
     np.testing.assert_allclose(fitted.uncertainty.parts[-1], shared, rtol=1e-9)
     assert fitted.uncertainty.freedom[-1] == np.inf
