@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Confidence intervals of an RMS error, and its growth from night to night (docs/verification.md).
+"""Confidence intervals of an RMS error, the verdict by them, and a chart (docs/verification.md).
 
 The sum of squares over K configurations with errors e_k is approximated by theta / nu chi2(nu)
 (Satterthwaite 1946) with
@@ -9,7 +9,11 @@ The sum of squares over K configurations with errors e_k is approximated by thet
 
 c^2 is the variance of the squared errors over their squared mean, estimated with g for one more
 configuration and raised by SAFETY standard deviations, because few configurations rarely include
-the worst places.
+the worst places. With the wanted RMS error as limit the verdict is
+
+    PASS        the whole interval is within the limit
+    FAIL        the whole interval is beyond it
+    UNDECIDED   the limit lies in the interval: more poses are needed
 
 A chart of nights: the RMS error r of one, with nu degrees of freedom, is compared with the pooled
 square s^2 of earlier nights. If nothing has changed r^2 / s^2 has an F distribution, which makes
@@ -28,16 +32,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from typing import Literal, TypeAlias
 
 import numpy as np
 from scipy import special
 
-from calib_ros.decision.comparison import Comparison
-from calib_ros.errors import InputError
+from calib_ros.decision import mistakes
+from calib_ros.decision.comparison import Comparison, along_base, compare
+from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.estimation.configurations import renumber
 from calib_ros.estimation.levels import CONFIDENT
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.se3 import FloatArray, Index, norms
+from calib_ros.settings import Settings
+from calib_ros.values import SAME
 
+Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
+STANDS: dict[Verdict, Verdict] = {'PASS': 'holds', 'FAIL': 'does not hold'}
+DECIDING = 10 * MOST_ENTRIES  # largest number of configurations reported as deciding
 SAFETY = 4.0
 """Intervals of 95 % then hold in 95 % if places differ (benchmarks/verification.py)."""
 
@@ -68,8 +82,6 @@ def rms_interval(errors: FloatArray, group: Index) -> tuple[float, float]:
     if len(moments) < 2:
         return 0.0, np.inf
     rms = float(np.sqrt(np.mean(norms(errors) ** 2)))
-    if rms == 0.0:
-        return 0.0, 0.0
     freedom = np.array([freedom_of(moments) / np.sum(shares**2)])
     lower, upper = rms_limits(rms, freedom, CONFIDENT)
     return float(lower[0]), float(upper[0])
@@ -97,7 +109,125 @@ def moments_of(errors: FloatArray, group: Index) -> FloatArray:
     """Return the mean of e e^T (K, 3, 3) [m^2] of errors (N, 3) [m] over each configuration."""
     sums = np.array([[np.bincount(group, a * b) for b in errors.T] for a in errors.T])
     sums /= np.bincount(group)
-    return sums.transpose(2, 0, 1)
+    return sums.transpose(2, 0, 1) + SAME**2 * np.eye(3)  # without noise
+
+
+def limits_of(
+    moments: FloatArray, lost: int, confidence: float, most: int = 0
+) -> tuple[float, Index, FloatArray, FloatArray, FloatArray]:
+    """Return the RMS error [m] of configurations with moments (K, 3, 3), each counted once.
+
+    And for numbers (N,) of them, from K up to `most`, the freedom and limits. Fitted frames have
+    absorbed the errors of `lost` ones. Of a single one the upper limit is inf.
+    """
+    rms, count = rms_of(moments, lost), len(moments)
+    numbers = np.unique(np.geomspace(count, max(count, most), 200).round().astype(int))
+    freedom = (freedom_of(moments) if count > 1 else 3.0) * (numbers - lost)  # or its coordinates
+    lower, upper = rms_limits(rms, freedom, confidence)
+    return rms, numbers, freedom, lower, np.where(numbers > 1, upper, np.inf)
+
+
+def rms_of(moments: FloatArray, lost: int) -> float:
+    """Return the RMS error [m] of configurations (K, 3, 3), of which fitted frames absorb some."""
+    return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(len(moments) - lost, 1)))
+
+
+def compared(limit: float, lower: float, upper: float) -> Literal['PASS', 'FAIL', 'UNDECIDED']:
+    """Return the verdict on an RMS error by its interval."""
+    return 'PASS' if upper <= limit else 'FAIL' if lower > limit else 'UNDECIDED'
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Judgement:
+    """Errors of new measurements before and after a correction, and the verdict."""
+
+    comparison: Comparison
+    """Residuals by the nominal and by the calibrated arm, along the axes of its base."""
+    limit: float | None
+    """The tolerance, or else the largest error [m] of a calibration that holds, if known."""
+    confidence: float
+    """Of the interval."""
+    rms: float
+    lower: float
+    upper: float
+    """RMS position error [m] over poses like these, and its interval."""
+    freedom: float
+    """Degrees of freedom of that error."""
+    verdict: Verdict
+    """Without a tolerance 'holds' and 'does not hold' instead of PASS and FAIL, or 'no verdict' if
+    the former error is unknown; no verdict either if fitted measurements look good, or if a
+    `mistake` explains them."""
+    needed: int | None
+    """Configurations that would decide with the same RMS error; None if not even DECIDING."""
+    reused: float
+    """Share of the measurements that the calibration was fitted to (`Calibration.reused`)."""
+    mistake: mistakes.Diagnosis | None
+    """What explains measurements that are further off than any arm."""
+
+    @property
+    def failed(self) -> bool:
+        """Tell whether the error is beyond the limit."""
+        return self.verdict in ('FAIL', 'does not hold')
+
+    @property
+    def group(self) -> Index:
+        """Return the configuration (N,) of each measurement; `configurations` counts them."""
+        return self.comparison.before.configurations
+
+    @property
+    def configurations(self) -> int:
+        """Return the number of different configurations."""
+        return int(self.group.max()) + 1
+
+
+def judge(
+    arm: Calibration,
+    sets: Sequence[Observations],
+    found: Comparison | None = None,
+    tolerance: float | None = None,
+    confidence: float = CONFIDENT,
+    lost: int = 0,
+) -> Judgement:
+    """Judge a calibrated arm by its errors at new measurements, in its frames if not given.
+
+    Each configuration counts once, however often it was measured; fitted frames have absorbed the
+    errors of `lost` ones. Without a `tolerance` [m] the limit is that of the calibration.
+    """
+    found = found or along_base(compare(arm.before, arm.chain, sets), arm.chain, sets)
+    moments = moments_of(found.after.position, found.before.configurations)
+    rms, numbers, freedom, lower, upper = limits_of(moments, lost, confidence, DECIDING)
+    mistake = _mistake(arm, sets, rms, 1e-3 * (found.figures[1].rms_mrad or 0.0))
+    reused, limit = arm.reused(sets), tolerance or arm.limit(sets, found.figures[0].rms_mm)
+    verdict: Verdict = 'no verdict'
+    if limit is not None and not mistake:
+        verdict = compared(limit, lower[0], upper[0])
+        decided = numbers[(upper <= limit) | (lower > limit)]
+    if reused and verdict != 'FAIL':
+        verdict = 'no verdict'
+    return Judgement(
+        comparison=found,
+        limit=limit,
+        confidence=confidence,
+        rms=rms,
+        lower=float(lower[0]),
+        upper=float(upper[0]),
+        freedom=float(freedom[0]),
+        verdict=STANDS.get(verdict, verdict) if tolerance is None else verdict,
+        needed=None if verdict == 'no verdict' or not decided.size else int(decided[0]),
+        reused=reused,
+        mistake=mistake,
+    )
+
+
+def _mistake(
+    arm: Calibration, sets: Sequence[Observations], error: float, angle: float
+) -> mistakes.Diagnosis | None:
+    if error <= Settings.largest_error and angle <= Settings.largest_angle:
+        return None
+    problem = Problem(arm.before, sets[0], more=sets[1:])
+    found = mistakes.diagnose(problem, far=True) or mistakes.diagnose_alone(problem, arm.chain)
+    known = error > Settings.largest_error or (found and found.alone)  # else positions fit
+    return found if known else None
 
 
 SLOPES = (0.5, 2.0)

@@ -7,23 +7,16 @@ pose, so its error is measured - C(q); uncorrected it would be measured - N(q). 
 the joint values that the controller reports. If the uncorrected program is known, the wanted pose
 is N(q_commanded), and a missing correction shows as well.
 
-The figure is the RMS position error over poses like those measured, with its interval
-(`confidence.py`):
-
-    PASS        the whole interval is within the tolerance
-    FAIL        the whole interval is beyond it
-    UNDECIDED   the tolerance lies in the interval: more poses are needed
-
-On request, frames of the new measurements are fitted to both arms: the base if the device was
-moved, the tool if the target was changed or remounted. The change of any other frame counts as an
-error of the arm.
+The verdict is that of `confidence.py`. On request, frames of the new measurements are fitted to
+both arms: the base if the device was moved, the tool if the target was changed or remounted. The
+change of any other frame counts as an error of the arm.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -31,12 +24,11 @@ from scipy.spatial import cKDTree
 from calib_ros.annotated import Confidence, InMetres, as_annotated
 from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.compensation import Compensator
-from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
-from calib_ros.decision import mistakes
+from calib_ros.apply.confidence import Judgement, judge, limits_of, moments_of, rms_of
 from calib_ros.decision.comparison import Comparison, along_base, axes_of, by_axes, compare
 from calib_ros.decision.moved import Step
-from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
-from calib_ros.estimation.configurations import configurations
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
@@ -50,14 +42,9 @@ from calib_ros.kinematics.effects import coupled
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
-from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, Shown, as_html, rounded
-from calib_ros.values import SAME
 
-Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
-STANDS: dict[Verdict, Verdict] = {'PASS': 'holds', 'FAIL': 'does not hold'}
 NEEDED = 1 + len(TILTED)  # configurations without those for fitted frames: as in ISO 9283
-DECIDING = 10 * MOST_ENTRIES  # largest number of configurations reported as deciding
 
 
 class Attained(NamedTuple):
@@ -78,31 +65,11 @@ class Attained(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Verification(Shown):
-    """Errors before and after a correction, and the verdict."""
+class Verification(Judgement, Shown):
+    """A judgement of a calibrated arm, and what explains the errors."""
 
-    comparison: Comparison
-    """Residuals by the nominal and by the calibrated arm, along the axes of its base."""
     tolerance: float | None
     """Wanted RMS position error [m]."""
-    limit: float | None
-    """The tolerance, or else the largest error [m] of a calibration that holds, if known."""
-    confidence: float
-    """Of the interval."""
-    group: Index
-    """(N,) configuration of each measurement; `configurations` counts them."""
-    rms: float
-    lower: float
-    upper: float
-    """RMS position error [m] over poses like these, and its interval."""
-    freedom: float
-    """Degrees of freedom of that error."""
-    verdict: Verdict
-    """Without a tolerance 'holds' and 'does not hold' instead of PASS and FAIL, or 'no verdict' if
-    the former error is unknown; no verdict either if fitted measurements look good, or if a
-    `mistake` explains them."""
-    needed: int | None
-    """Configurations that would decide with the same RMS error; None if not even DECIDING."""
     common: float
     """Share of the RMS error that remains without one common shift and turn of all positions."""
     by_program: bool
@@ -111,16 +78,12 @@ class Verification(Shown):
     """The calibrated arm in the frame of its base, with fitted tools."""
     fitted: tuple[str, ...] = ()
     """Frames fitted to the new measurements."""
-    reused: float = 0.0
-    """Share of the measurements that the calibration was fitted to (`Calibration.reused`)."""
     outside: float = 0.0
     """Share of the measurements outside the region of the calibration."""
     uncorrected: bool = False
     """Whether all measurements were taken at the joint values of the program as it was given."""
     odd: tuple[int, ...] = ()
     """Configurations without which the others would be within the limit."""
-    mistake: mistakes.Diagnosis | None = None
-    """What explains measurements that are further off than any arm."""
     step: Step | None = None
     """What moved during the measurement, if the arm exceeds the limit."""
 
@@ -136,11 +99,6 @@ class Verification(Shown):
             ('limit', '', '' if self.limit is None else rounded(1e3 * self.limit)),
         )
         return as_html(self.verdict, (), rows)
-
-    @property
-    def configurations(self) -> int:
-        """Return the number of different configurations."""
-        return int(self.group.max()) + 1
 
     @property
     def each(self) -> tuple[Attained, ...]:
@@ -181,39 +139,25 @@ def verify(
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
     _check(arm, sets, fitted)
-    group = configurations(np.concatenate([each.joints for each in sets]))
-    comparison, left, uncorrected, chain = _compared(arm, sets, commanded, fitted, group)
+    comparison, left, uncorrected, chain = _compared(arm, sets, commanded, fitted)
     progress(2 / 3)
-    moments = moments_of(comparison.after.position, group) + SAME**2 * np.eye(3)  # without noise
     lost = new_base + new_tool + (new_tool if all(each.seen for each in sets) else new_base)
-    rms, numbers, freedom, lower, upper = _interval(moments, lost, confidence, DECIDING)
-    mistake = _mistake(arm, sets, rms, 1e-3 * (comparison.figures[1].rms_mrad or 0.0))
-    reused, limit = arm.reused(sets), tolerance or arm.limit(sets, comparison.figures[0].rms_mm)
-    verdict, needed = _decided(limit, lower, upper, numbers)
-    if mistake or (reused and verdict != 'FAIL'):
-        verdict, needed = 'no verdict', None
+    if (count := count_distinct(comparison.before.configurations)) - lost < NEEDED:
+        were, more = 'pose was' if count == 1 else 'poses were', NEEDED + lost
+        of_frames = f', {lost} of them for the refitted frames' if lost else ''
+        raise InputError(f'{count} {were} measured; at least {more} are needed{of_frames}')
+    found = judge(arm, sets, comparison, tolerance, confidence, lost)
     return Verification(
-        comparison=comparison,
+        **vars(found),
         tolerance=tolerance,
-        limit=limit,
-        confidence=confidence,
-        group=group,
-        rms=rms,
-        lower=float(lower[0]),
-        upper=float(upper[0]),
-        freedom=float(freedom[0]),
-        verdict=STANDS.get(verdict, verdict) if tolerance is None else verdict,
-        needed=needed,
-        common=1.0 if new_base or np.isinf(left) else left / rms,
+        common=1.0 if new_base or np.isinf(left) else left / found.rms,
         by_program=commanded is not None,
         chain=chain,
         fitted=fitted,
-        reused=reused,
         outside=arm.outside(sets),
         uncorrected=uncorrected,
-        odd=() if limit is None else _odd(moments, lost, limit, confidence),
-        mistake=mistake,
-        step=arm.step(sets) if verdict == 'FAIL' else None,
+        odd=() if found.limit is None else _odd(found, found.limit, lost),
+        step=arm.step(sets) if found.failed else None,
     )
 
 
@@ -222,9 +166,8 @@ def _compared(
     sets: Sequence[Observations],
     commanded: FloatArray | None,
     fitted: tuple[str, ...],
-    group: Index,
 ) -> tuple[Comparison, float, bool, Chain]:
-    """Return the residuals, and their RMS [m] over configurations (N,) without a common motion.
+    """Return the residuals, and their RMS [m] over configurations without a common motion.
 
     The latter is infinite for pixels, which have no positions. And whether all were measured at
     the commanded joint values, not at corrected ones, and the arm in the frame of its base.
@@ -239,58 +182,28 @@ def _compared(
         wanted = [replace(s, joints=q) for s, (q, _) in zip(sets, found, strict=True)]
         uncorrected = not any(corrected.any() for _, corrected in found)
     before, after = _in_new_frames(before, sets, fitted), _in_new_frames(after, wanted, fitted)
-    pair = compare(before, after, sets).before, compare(before, after, wanted).after
+    pair = replace(compare(before, after, sets), after=compare(before, after, wanted).after)
     left = np.inf
     if all(each.pixels is None for each in sets):
         shaped = compare(before, _rebased(after, wanted), wanted).after
-        left = _rms(moments_of(shaped.position, group), IN_A_FRAME // 3)
-    first, last = (along_base(each, after, sets) for each in pair)
+        left = rms_of(moments_of(shaped.position, pair.before.configurations), IN_A_FRAME // 3)
     own = ((name, Frame() if name[:4] == 'base' else each) for name, each in after.frames)
     chain = replace(arm.chain, base=Frame(), tool=after.tool, frames=tuple(own))
-    return Comparison(first, last, np.ones(len(group), dtype=bool)), left, uncorrected, chain
+    return along_base(pair, after, sets), left, uncorrected, chain
 
 
-def _mistake(
-    arm: Calibration, sets: Sequence[Observations], error: float, angle: float
-) -> mistakes.Diagnosis | None:
-    if error <= Settings.largest_error and angle <= Settings.largest_angle:
-        return None
-    problem = Problem(arm.before, sets[0], more=sets[1:])
-    found = mistakes.diagnose(problem, far=True) or mistakes.diagnose_alone(problem, arm.chain)
-    known = error > Settings.largest_error or (found and found.alone)  # else positions fit
-    return found if known else None
-
-
-def _rms(moments: FloatArray, lost: int) -> float:
-    """Return the RMS error [m] of configurations, some of them absorbed by fitted frames."""
-    return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(len(moments) - lost, 1)))
-
-
-def _interval(
-    moments: FloatArray, lost: int, confidence: float, most: int = 0
-) -> tuple[float, Index, FloatArray, FloatArray, FloatArray]:
-    """Return the RMS error [m], up to so many configurations (K,), and its freedom and limits."""
-    rms, count = _rms(moments, lost), len(moments)
-    if count - lost < NEEDED:
-        were, more = 'pose was' if count == 1 else 'poses were', NEEDED + lost
-        of_frames = f', {lost} of them for the refitted frames' if lost else ''
-        raise InputError(f'{count} {were} measured; at least {more} are needed{of_frames}')
-    numbers = np.unique(np.geomspace(count, max(count, most), 200).round().astype(int))
-    freedom = freedom_of(moments) * (numbers - lost)
-    return rms, numbers, freedom, *rms_limits(rms, freedom, confidence)
-
-
-def _odd(moments: FloatArray, lost: int, limit: float, confidence: float) -> tuple[int, ...]:
+def _odd(found: Judgement, limit: float, lost: int) -> tuple[int, ...]:
     """Return the configurations without which the others are within a limit exceeded with them.
 
     Outliers, or all on one side of the moment that best divides errors of two sizes. Without gross
     errors the others need not decide.
     """
+    moments = moments_of(found.comparison.after.position, found.group)
 
     def limits(which: Index) -> tuple[float, float, float]:
         if len(which) - lost < NEEDED:
             return 0.0, np.inf, np.inf
-        rms, *_, (lower,), (upper,) = _interval(moments[which], lost, confidence)
+        rms, *_, (lower,), (upper,) = limits_of(moments[which], lost, found.confidence)
         return float(lower), rms, float(upper)
 
     squares = np.trace(moments, axis1=1, axis2=2)
@@ -304,19 +217,6 @@ def _odd(moments: FloatArray, lost: int, limit: float, confidence: float) -> tup
         if limits(np.setdiff1d(every, bad))[bound] <= limit < limits(every)[bound]:
             return tuple(bad.tolist())
     return ()
-
-
-def _decided(
-    tolerance: float | None, lower: FloatArray, upper: FloatArray, numbers: Index
-) -> tuple[Verdict, int | None]:
-    """Return the verdict by the first limits, and the least of the numbers that decides."""
-    if tolerance is None:
-        return 'no verdict', None
-    decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
-    needed = int(numbers[decided[0]]) if decided.size else None
-    if lower[0] <= tolerance < upper[0]:
-        return 'UNDECIDED', needed
-    return ('PASS' if upper[0] <= tolerance else 'FAIL'), needed
 
 
 def _check(arm: Calibration, sets: Sequence[Observations], fitted: tuple[str, ...]) -> None:

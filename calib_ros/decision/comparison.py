@@ -162,11 +162,15 @@ def compare(
     return Comparison(first, last, every if judged is None else judged)
 
 
-def along_base(found: Residuals, chain: Chain, sets: Sequence[Observations]) -> Residuals:
+def along_base(found: Comparison, chain: Chain, sets: Sequence[Observations]) -> Comparison:
     """Return residuals of sets along the axes of the arm's base, which all devices share."""
     turns = np.concatenate([axes_of(chain, each) for each in sets])
-    position, orientation = by_axes(found.position, turns), by_axes(found.orientation, turns)
-    return replace(found, position=position, orientation=orientation)
+
+    def turned(which: Residuals) -> Residuals:
+        position, orientation = by_axes(which.position, turns), by_axes(which.orientation, turns)
+        return replace(which, position=position, orientation=orientation)
+
+    return replace(found, before=turned(found.before), after=turned(found.after))
 
 
 def by_axes(vectors: FloatArray, axes: FloatArray) -> FloatArray:

@@ -16,8 +16,7 @@ from urllib.parse import quote
 import numpy as np
 
 import calib_ros
-from calib_ros.apply.confidence import interval_of
-from calib_ros.apply.verification import Verification
+from calib_ros.apply.confidence import Judgement, interval_of
 from calib_ros.decision.comparison import ErrorFigures
 from calib_ros.decision.result import Identification
 from calib_ros.errors import LONGEST_NAME, ConfigError
@@ -179,20 +178,13 @@ def result_row(result: Identification, about: Filing, warnings: Sequence[str] = 
     )
 
 
-def validation_row(
-    chain: Chain, before: ErrorFigures | None, after: ErrorFigures, verdict: str, about: Filing
-) -> Row:
-    """Return the row of a validation: a calibration on later poses."""
-    return _row(about, 'validate', chain, verdict, (before, after))
-
-
-def verification_row(chain: Chain, found: Verification, about: Filing) -> Row:
-    """Return the row of a verification; without freedom, so in no chart, of unfit poses."""
+def verification_row(chain: Chain, found: Judgement, about: Filing, kind: str = 'verify') -> Row:
+    """Return the row of a verdict on later poses; without freedom (in no chart) of unfit ones."""
     before, after = found.comparison.figures
     figures = before, replace(after, rms_mm=1e3 * found.rms)
     limits = found.lower, found.upper
     freedom = None if found.reused or found.mistake else found.freedom
-    return _row(about, 'verify', chain, found.verdict, figures, limits, rms_freedom=freedom)
+    return _row(about, kind, chain, found.verdict, figures, limits, rms_freedom=freedom)
 
 
 def _row(
@@ -200,13 +192,13 @@ def _row(
     kind: str,
     chain: Chain,
     verdict: str,
-    figures: tuple[ErrorFigures | None, ErrorFigures],
-    limits: tuple[float, float] | None = None,
+    figures: tuple[ErrorFigures, ErrorFigures],
+    limits: tuple[float, float],
     **more: Any,
 ) -> Row:
     before, after = figures
     more |= {name: getattr(after, name) for name in ('rms_mm', 'mean_mm', 'max_mm', 'rms_mrad')}
-    if limits is not None and np.isfinite(limits).all():
+    if np.isfinite(limits).all():
         more |= {'lower_mm': 1e3 * limits[0], 'upper_mm': 1e3 * limits[1]}
     return Row(
         **asdict(about),
@@ -215,6 +207,6 @@ def _row(
         chain=json.dumps(chain_document(chain)),
         verdict=verdict,
         poses=after.count,
-        rms_before_mm=None if before is None else before.rms_mm,
+        rms_before_mm=before.rms_mm,
         **more,
     )

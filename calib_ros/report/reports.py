@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.apply.confidence import interval_of
+from calib_ros.apply.confidence import compared, interval_of
 from calib_ros.apply.workspace import survey
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.reasons import Rule
@@ -162,10 +162,10 @@ def _within(judged: Comparison, tolerance: float | None, when: int = 1) -> str:
     if tolerance is None:
         return ''
     wanted = f'within the tolerance of {1e3 * tolerance:g} mm RMS'
-    lower, upper = interval_of(judged, when)
-    if upper <= tolerance:
+    verdict = compared(tolerance, *interval_of(judged, when))
+    if verdict == 'PASS':
         return f' and {wanted}'
-    return f', but {"" if lower > tolerance else "perhaps "}not {wanted}'
+    return f', but {"" if verdict == "FAIL" else "perhaps "}not {wanted}'
 
 
 def advice_of(result: Identification) -> tuple[Advice, ...]:
@@ -203,17 +203,16 @@ def _steps(
 ) -> tuple[str, ...]:
     if not result.accepted:
         return () if _sound(reasons) else (reasons[0].again,)
-    lower, upper = interval_of(result.validation or result.fitted, 1)
-    beyond = tolerance is not None and lower > tolerance
-    undecided = tolerance is not None and lower <= tolerance < upper
+    interval = interval_of(result.validation or result.fitted, 1)
+    verdict = '' if tolerance is None else compared(tolerance, *interval)
     whole = result.region is None or result.region.whole
     found = {
         'First check what is named above. If it is true, remove the cause and identify '
         'again.': bool(result.remarks),
-        sentence(CLOSER): may_be_closer(result, beyond),
+        sentence(CLOSER): may_be_closer(result, verdict == 'FAIL'),
         'Compare the remaining error with the accuracy of the measuring device: no calibration '
-        'gets below that.': beyond,
-        f'Measure more poses to decide on the tolerance, {SPREAD_OUT}.': undecided,
+        'gets below that.': verdict == 'FAIL',
+        f'Measure more poses to decide on the tolerance, {SPREAD_OUT}.': verdict == 'UNDECIDED',
         sentence(bring(result)): True,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
         'arm: calib_ros verify.': whole,

@@ -9,7 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.apply.verification import DECIDING, Verification
+from calib_ros.apply.confidence import DECIDING
+from calib_ros.apply.verification import Verification
 from calib_ros.estimation.levels import ALIKE, NEARER
 from calib_ros.identification.records import reused_in_words
 from calib_ros.kinematics.chain import Chain
@@ -172,7 +173,7 @@ def causes(found: Verification) -> list[str]:
     lines: list[str] = []
     if found.mistake:
         return lines
-    if found.uncorrected and found.verdict in ('FAIL', 'does not hold'):
+    if found.uncorrected and found.failed:
         lines.append(
             'the arm stood at the joint values of --commanded themselves: either the correction '
             'is not active, or this is the corrected program: give the program as it was before '

@@ -8,16 +8,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from calib_ros.apply.confidence import interval_of, rms_limits
-from calib_ros.apply.verification import Verdict
+from calib_ros.apply.confidence import Judgement, interval_of
 from calib_ros.decision.changes import FALSE_ALARM, changes_in_words
 from calib_ros.decision.comparison import Comparison, ErrorFigures
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.noise import Noise
-from calib_ros.estimation.observations import Observations
-from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.records import reused_in_words
 from calib_ros.kinematics import effects
@@ -160,60 +157,46 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
     )
 
 
-def still_holds(
-    previous: Calibration, found: Recalibration, sets: Sequence[Observations] = ()
-) -> tuple[bool, str]:
-    """Return whether a calibration holds at the last stops, those of sets, and why."""
-    last = counted(found.before.count, 'pose')
-    text = f'RMS {found.before.rms_mm:.3f} mm at the last {last}'
-    if found.changed:
-        reasons = changes_in_words(found.changed)
+def still_holds(updated: Recalibration, found: Judgement) -> tuple[bool, str]:
+    """Return whether a calibration holds at the last stops, and why."""
+    text = f'RMS {1e3 * found.rms:.3f} mm at the last {counted(found.configurations, "pose")}'
+    if updated.changed:
+        reasons = changes_in_words(updated.changed)
         return False, (
             f'the calibration in use no longer fits, {reasons}: was it, the target or the device '
             f'bumped? {text}; call ~/clear, measure 8 poses or more, ~/identify, or run calib_ros '
             'identify --previous'
         )
-    if found.unexplained <= FALSE_ALARM:
+    if updated.unexplained <= FALSE_ALARM:
         return False, (
             f'{text}, more than the calibration in use and noise explain; no change of a few '
             'parameters explains it: call ~/clear, measure new poses and call ~/identify'
         )
-    limit = previous.limit(sets)
-    if limit is not None and _least_and_most(found.comparison, 0)[0] > limit:
-        return False, NO_LONGER_HOLDS.format(text, 1e3 * limit)
+    if found.limit is not None and found.failed:
+        return False, NO_LONGER_HOLDS.format(text, 1e3 * found.limit)
     return True, f'the calibration in use agrees with the measurements: {text}'
 
 
-def verdict(
-    calibration: Calibration,
-    found: Comparison,
-    reused: float = 0.0,
-    sets: Sequence[Observations] = (),
-) -> tuple[Verdict, str]:
-    """Return whether a calibration holds on samples, of which a share is `reused`, and why.
-
-    By the rule of `verify`: undecided if the interval of the error contains the limit.
-    """
-    nominal, now = found.figures
-    text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
-    since = f'{counted(now.count, "pose")} measured since'
-    text += f'{since}; the nominal chain has {nominal.rms_mm:.3f} mm'
-    limit = calibration.limit(sets, nominal.rms_mm)
-    if limit is None:
-        text = f'no verdict, the calibration has no former error: {text}'
-        return 'no verdict', f'{text}; judge with calib_ros verify --tolerance'
-    least, most = _least_and_most(found, 1)
-    if least > limit:
-        return 'does not hold', NO_LONGER_HOLDS.format(text, 1e3 * limit)
-    text += f'; the limit is {1e3 * limit:.3f} mm'
-    if warning := reused_in_words(reused):
-        text = f'RMS {now.rms_mm:.3f} mm on {since}'
-        return 'no verdict', f'no verdict: {warning}: measure new ones; {text}'
-    if most > limit:
-        text = f'too few poses to tell whether the calibration holds: {text}; measure more'
-        return 'UNDECIDED', text
+def verdict_in_words(found: Judgement) -> str:
+    """Return whether a calibration holds on new measurements, and why."""
+    nominal, now = found.comparison.figures
+    since = f'{counted(found.configurations, "pose")} measured since'
+    text = f'RMS {1e3 * found.rms:.3f} mm (max {now.max_mm:.3f}) on {since}'
+    if found.mistake:
+        return f'no verdict: {found.mistake}; {text}'
+    told = f'{text}; the nominal chain has {nominal.rms_mm:.3f} mm'
+    if found.limit is None:
+        told = f'no verdict, the calibration has no former error: {told}'
+        return f'{told}; judge with calib_ros verify --tolerance'
+    if found.failed:
+        return NO_LONGER_HOLDS.format(told, 1e3 * found.limit)
+    if warning := reused_in_words(found.reused):
+        return f'no verdict: {warning}: measure new ones; {text}'
+    told += f'; the limit is {1e3 * found.limit:.3f} mm'
+    if found.verdict == 'UNDECIDED':
+        return f'too few poses to tell whether the calibration holds: {told}; measure more'
     turned = turned_in_words(now)
-    return 'holds', f'the calibration holds: {text}' + f'; but {turned}' * bool(turned)
+    return f'the calibration holds: {told}' + f'; but {turned}' * bool(turned)
 
 
 def turned_in_words(figures: ErrorFigures) -> str:
@@ -225,15 +208,6 @@ def turned_in_words(figures: ErrorFigures) -> str:
         f'the orientations are {turned:.0f} mrad off, but only positions are judged: check '
         'their format (order of the quaternion or angles, degrees) and the target'
     )
-
-
-def _least_and_most(found: Comparison, when: int) -> tuple[float, float]:
-    """Return the 95 % interval [m] of the RMS error; of a single pose by its coordinates."""
-    least, most = interval_of(found, when)
-    if np.isinf(most):
-        rms, coordinates = 1e-3 * found.figures[when].rms_mm, np.array([3.0])
-        least = float(rms_limits(rms, coordinates, CONFIDENT)[0][0])
-    return least, most
 
 
 NO_LONGER_HOLDS = (

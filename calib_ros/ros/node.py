@@ -23,15 +23,15 @@ from rclpy.clock import Clock, ClockType
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from calib_ros.apply.confidence import judge
 from calib_ros.atomic import given_path
-from calib_ros.decision.comparison import compare
 from calib_ros.errors import CalibrationError, ConfigError, InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.cameras import cameras_of
 from calib_ros.files.programs import read_joints
-from calib_ros.files.rows import validation_row
+from calib_ros.files.rows import verification_row
 from calib_ros.identification.age import years_since
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibration import recalibrate
@@ -315,16 +315,16 @@ class CalibrationNode(Batched):
         self, given: tuple[Calibration, list[Observations], Callable[..., str]]
     ) -> Answer:
         calibration, sets, filed = given
-        found = compare(calibration.before, calibration.chain, sets)
-        verdict, text = words.verdict(calibration, found, calibration.reused(sets), sets)
-        row = partial(validation_row, calibration.chain, *found.figures, verdict)
-        return verdict == 'holds', text + filed(row, table_hash(calibration.chain))
+        found = judge(calibration, sets)
+        row = partial(verification_row, calibration.chain, found, kind='validate')
+        text = words.verdict_in_words(found) + filed(row, table_hash(calibration.chain))
+        return found.verdict == 'holds', text
 
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:
         calibration, problem = found
         years = years_since(calibration.record, problem.all_sets)
         updated = recalibrate(calibration, problem, years)
-        return words.still_holds(calibration, updated, problem.all_sets)
+        return words.still_holds(updated, judge(calibration, problem.all_sets))
 
     def _on_clear(self, request: Any) -> Answer:
         count = len(self.session.samples)

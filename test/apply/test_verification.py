@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 from verified import NOISE, UR, in_words, measured, verification_page, with_errors
 
-from calib_ros.apply import simulation, verification
+from calib_ros.apply import simulation
 from calib_ros.apply.candidates import iso_9283_poses
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.confidence import rms_interval, rms_limits
@@ -155,7 +155,7 @@ def test_the_limits_hold_as_often_as_they_say(shape, count):
 
 
 def test_the_limits_of_a_verdict_are_those(arm, monkeypatch):
-    monkeypatch.setattr(verification, 'DECIDING', 5)  # fewer than were measured
+    monkeypatch.setattr('calib_ros.apply.confidence.DECIDING', 5)  # fewer than were measured
     errors = np.random.default_rng(0).normal(scale=1e-4, size=(7, 3))
     found = verify(arm, [with_errors(arm, errors)], 1e-4)
     wanted = rms_interval(errors, np.arange(7))

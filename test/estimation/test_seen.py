@@ -11,7 +11,7 @@ from fits import NOISE, UR10E, arm
 from calib_ros import CalibrationSession, Settings
 from calib_ros.apply.design import Design, accuracy
 from calib_ros.apply.verification import verify
-from calib_ros.decision.comparison import along_base, residuals
+from calib_ros.decision.comparison import along_base, compare
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
@@ -104,7 +104,7 @@ def test_residuals_are_shown_along_the_base(rng):
     joints = UR10E.random_joints(20, rng)
     chain = identify(Problem(UR10E, seen(true, joints))).chain
     moved = seen(true, joints, ball=BALL + np.array([0.0, 0.0, 0.01]))
-    found = along_base(residuals(chain, moved), chain, [moved]).position
+    found = along_base(compare(chain, chain, [moved]), chain, [moved]).after.position
     np.testing.assert_allclose(found, np.tile(found[0], (20, 1)), atol=1e-5)
     assert np.linalg.norm(found[0]) == pytest.approx(0.01, rel=1e-3)
 

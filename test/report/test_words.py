@@ -9,6 +9,7 @@ import pytest
 from pages import problem_of, report_of
 from verified import in_words, verification_page
 
+from calib_ros.apply.confidence import judge
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
 from calib_ros.decision.comparison import Comparison, Residuals
@@ -23,8 +24,15 @@ from calib_ros.report import words
 from calib_ros.report.advice import FAR, SPREAD_OUT
 from calib_ros.report.reports import CLOSER, may_be_closer
 from calib_ros.report.verdicts import standing
-from calib_ros.report.words import rms_range_mm, still_holds, verdict
+from calib_ros.report.words import rms_range_mm, still_holds, verdict_in_words
 from calib_ros.shown import rounded, sentence
+
+
+def off_by(*errors_mm, turn=np.nan):
+    """Return residuals along x, at a configuration each."""
+    away = 1e-3 * np.outer(errors_mm, [1.0, 0.0, 0.0])
+    off = Residuals(away, np.full_like(away, turn), np.arange(len(away)), np.nan * away)
+    return Comparison(off, off, np.ones(len(away), bool))
 
 
 @pytest.mark.parametrize(
@@ -35,33 +43,32 @@ def test_a_calibration_holds_by_one_rule(rms_mm, says):
     """By ~/validate, and by ~/check where no change shows besides: by the interval."""
     arm = load_chain('ur10e')
     previous = Calibration(arm, arm, residual=1e-4)
-    away = np.tile([1e-3 * rms_mm, 0.0, 0.0], (20, 1))
-    off = Residuals(away, np.nan * away, np.arange(20), np.nan * away)
-    both = Comparison(off, off, np.ones(20, bool))
-    less = replace(off, position=0.6 * away)
+    both = off_by(*[rms_mm] * 20)
+    less = off_by(*[0.6 * rms_mm] * 20).before
     updates = [
         Recalibration(previous, (), 1.0, judged, 1e-4, 1e-4, 0.0)
-        for judged in (both, Comparison(less, off, both.judged))  # predicted worse by 1.7
+        for judged in (both, replace(both, before=less))  # predicted worse by 1.7
     ]
-    told = verdict(previous, both)
-    assert told[0] == says
-    assert '; the limit is 0.150 mm' in told[1]
-    assert told[1].startswith('too few poses to tell') == (says == 'UNDECIDED')
-    turned = replace(off, orientation=np.ones((20, 3)))
-    _, text = verdict(previous, Comparison(turned, turned, both.judged))
-    assert ('the orientations are 1732 mrad off' in text) == (says == 'holds')
-    same = still_holds(previous, updates[0])
+    found = judge(previous, (), both)
+    told = verdict_in_words(found)
+    assert found.verdict == says
+    assert '; the limit is 0.150 mm' in told
+    assert told.startswith('too few poses to tell') == (says == 'UNDECIDED')
+    turned = replace(found, comparison=off_by(*[rms_mm] * 20, turn=1.0))
+    assert ('the orientations are 1732 mrad off' in verdict_in_words(turned)) == (says == 'holds')
+    same = still_holds(updates[0], found)
     assert same[0] == (says != 'does not hold')
-    for text in (told[1], same[1]):
+    for text in (told, same[1]):
         assert ('no longer holds: RMS 0.300 mm' in text) == (says == 'does not hold')
-    for of, share, why in (
-        (replace(previous, residual=None), 0.0, 'no former error'),
-        (previous, 0.3, 'fitted to 30 % of these measurements'),
-    ):  # as in `verify`
-        proves_nothing = 'does not hold' if says == 'does not hold' and share else 'no verdict'
-        found, text = verdict(of, both, share)
-        assert found == proves_nothing
-        assert (why in text) == (found == 'no verdict')
+    fitted = SimpleNamespace(share=lambda sets: 0.3)
+    for of, why in (
+        (replace(previous, residual=None), 'no former error'),
+        (replace(previous, rows=fitted), 'fitted to 30 % of these measurements'),
+    ):
+        kept = says == 'does not hold' and of.residual is not None
+        found = judge(of, (), both)
+        assert found.verdict == ('does not hold' if kept else 'no verdict')
+        assert (why in verdict_in_words(found)) != kept
     assert [each.accepted for each in updates] == [True, False]
 
 
@@ -71,12 +78,20 @@ def test_a_calibration_holds_by_one_rule(rms_mm, says):
 def test_a_single_pose_proves_little(rms_mm, says):
     """One of 14 of a sound arm was enough for "no longer holds"."""
     arm = load_chain('ur10e')
-    away = np.array([[1e-3 * rms_mm, 0.0, 0.0]])
-    off = Residuals(away, np.nan * away, np.arange(1), np.nan * away)
-    both = Comparison(off, off, np.ones(1, bool))
-    told = verdict(Calibration(arm, arm, residual=1e-4), both)
-    assert told[0] == says
-    assert 'on 1 pose measured since' in told[1]
+    found = judge(Calibration(arm, arm, residual=1e-4), (), off_by(rms_mm))
+    assert found.verdict == says
+    assert 'on 1 pose measured since' in verdict_in_words(found)
+
+
+def test_a_mistake_is_named_instead_of_a_verdict():
+    """As by `verify`: ~/validate said that the calibration no longer holds."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(0)
+    seen = measure(arm, arm.random_joints(10, rng), rng, 5e-5, 2e-4)
+    seen.positions[:] *= 1e3
+    found = judge(Calibration(arm, arm, residual=1e-4), [seen])
+    told = verdict_in_words(found)
+    assert found.verdict == 'no verdict'
+    assert told.startswith('no verdict: the positions are in mm')
 
 
 @pytest.mark.parametrize(('bumped', 'verdict'), [(0.0, 'holds'), (5e-3, 'does not hold')])

@@ -8,12 +8,12 @@ import pytest
 from sessions import TRUE, UR5E, drive, samples, session, tracker
 from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, take
 
+from calib_ros.apply.confidence import judge
 from calib_ros.apply.simulation import random_frame
-from calib_ros.decision.comparison import compare
 from calib_ros.errors import InputError
 from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report.words import verdict
+from calib_ros.report.words import verdict_in_words
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import NO_ACCIDENT
@@ -306,7 +306,7 @@ def test_the_world_is_the_frame_of_the_base():
 def judged(made):
     """Return the errors of the nominal and the calibrated arm since, as ~/validate takes them."""
     calibration, sets = made.since()
-    return compare(calibration.before, calibration.chain, sets)
+    return judge(calibration, sets).comparison
 
 
 @pytest.mark.parametrize('first', [0, 1])
@@ -339,10 +339,9 @@ def test_samples_that_were_fitted_are_known_again():
     made.identify()
     made.adopt(parse_calibration(made.calibration.dump(), 'file'), ())
     calibration, sets = made.since()
-    assert calibration.reused(sets) == 1.0
-    found, words = verdict(calibration, judged(made), 1.0, sets)
-    assert found == 'no verdict'
-    assert 'the calibration was fitted to these measurements' in words
+    found = judge(calibration, sets)
+    assert (found.verdict, found.reused) == ('no verdict', 1.0)
+    assert 'the calibration was fitted to these measurements' in verdict_in_words(found)
 
 
 def test_what_was_there_before_does_not_judge():
