@@ -70,12 +70,11 @@ class Shifts:
         for lot in columns:
             parts = []
             for stops, column in zip(self._stops, lot, strict=True):
-                series = _by_stop(column, *stops)
-                flat, slow = series.reshape(-1, series.shape[-1]), slow_cosines(series.shape[-1])
-                whole = norms(series.reshape(len(series), -1))
-                rest = (flat - flat @ slow.T @ slow).reshape(len(series), -1)
-                rest[norms(rest) <= HALF_THE_DIGITS * whole] = 0.0  # rounding
-                parts.append(rest)
+                rest = _by_stop(column, *stops)
+                slow, whole = slow_cosines(rest.shape[-1]), norms(rest.reshape(len(rest), -1))
+                rest -= rest @ slow.T @ slow
+                parts.append(rest.reshape(len(rest), -1))
+                parts[-1][norms(parts[-1]) <= HALF_THE_DIGITS * whole] = 0.0  # rounding
             lots.append(parts)
         every = [np.concatenate(parts) for parts in zip(*lots, strict=True)]
         pairs = zip(every, self._shifted, strict=True)

@@ -25,6 +25,7 @@ from calib_ros.estimation.leastsquares import row_samples, stacked
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SURE
 from calib_ros.estimation.observations import SOME_POSES, numbered
 from calib_ros.estimation.problem import Learned, Problem
+from calib_ros.estimation.samples import gram
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
@@ -195,7 +196,7 @@ class LinearModel:
         self._products = [np.pad(each, grown) for each in self._products]
         for cell in np.unique(self._folds, axis=1).T:
             part = self._columns[:, (self._folds == cell[:, np.newaxis]).all(axis=0)]
-            found = part[count:] @ part.T
+            found = np.hstack([part[count:] @ part[:count].T, gram(part[count:])])
             for products, fold in zip(self._products, cell, strict=True):
                 products[fold, count:] += found
         for products in self._products:
