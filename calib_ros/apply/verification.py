@@ -30,7 +30,7 @@ from calib_ros.decision.moved import Step
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import CONFIDENT
-from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.observations import Observations, frames_of_sets
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER
 from calib_ros.estimation.samples import residual_arrays
@@ -137,7 +137,7 @@ def verify(
 
     Raises InputError for too few poses, distances, unknown frames, or poses far from all commands.
     """
-    fitted = ('base',) * new_base + ('tool',) * new_tool
+    fitted = frames_of_sets(sets, new_base, new_tool)
     _check(arm, sets, fitted)
     comparison, left, uncorrected, chain = _compared(arm, sets, commanded, fitted)
     progress(2 / 3)
@@ -236,19 +236,18 @@ def _check(arm: Calibration, sets: Sequence[Observations], fitted: tuple[str, ..
 
 
 def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str, ...]) -> Chain:
-    """Return the chain with the requested base and tool frames fitted to positions.
+    """Return the chain with frames fitted to positions.
 
     A new tool gets its rotation from the orientations, if measured. If these hardly vary, the tool
     keeps its translation: the base absorbs the change.
     """
-    new = [*dict.fromkeys(getattr(each, end) for end in fitted for each in sets)]
-    if not new:
+    if not fitted:
         return chain
-    chain = released(chain, new)
+    chain = released(chain, fitted)
     plain = [replace(s, oriented=np.zeros_like(s.oriented), covariance=None) for s in sets]
     problem = Problem(chain, plain[0], more=plain[1:], loss='none')
-    chain = in_new_frames(problem, chain, new, problem.system(plain), needed=False)
-    for tool in (name for name in new if name in {each.tool for each in sets}):
+    chain = in_new_frames(problem, chain, fitted, problem.system(plain), needed=False)
+    for tool in (name for name in fitted if name in {each.tool for each in sets}):
         turns = np.zeros((3, 3))
         for each in (each for each in sets if each.tool == tool):
             now = chain.forward(each.joints, each.approach, each.base, tool)[each.oriented]

@@ -18,7 +18,7 @@ from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.errors import InputError
-from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.observations import Observations, frames_of_sets
 from calib_ros.estimation.problem import Problem
 from calib_ros.files import boards
 from calib_ros.files.lenses import read_lens
@@ -93,13 +93,12 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         previous = replace(previous, record={**previous.record, **known})
         for warning in loaded.warnings:
             screen.warn(warning)
-        new = ('base',) * options.new_base + ('tool',) * options.new_tool
         refuse_older(previous.record, loaded.problem.all_sets)
         years = years_since(previous.record, loaded.problem.all_sets)
-        growth = 1e-3 * options.growth
         problem = loaded.between(previous.frames_of(loaded.owners))
+        new = frames_of_sets(problem.all_sets, options.new_base, options.new_tool)
         with screen.work('looking for what has changed'):
-            found = recalibrate(previous, problem, years, growth, new)
+            found = recalibrate(previous, problem, years, 1e-3 * options.growth, new)
         figures = documents.figures_document(found.comparison)
         text = dump_json(found.document() | figures) + '\n'
         if options.out is not None:

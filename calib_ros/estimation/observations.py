@@ -324,6 +324,12 @@ def _refuse_other_than_rotations(turns: FloatArray) -> None:
         )
 
 
+def frames_of_sets(sets: Sequence[Observations], base: bool, tool: bool) -> tuple[str, ...]:
+    """Return the frames of all devices of sets, if wanted, and of all targets."""
+    ends = ('base',) * base + ('tool',) * tool
+    return tuple(dict.fromkeys(getattr(each, end) for end in ends for each in sets))
+
+
 def numbered(sets: Sequence[Observations]) -> tuple[Index, ...]:
     """Return the configuration numbers (N,) of each set, counted over all sets."""
     if len(sets) == 1:

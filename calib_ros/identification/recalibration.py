@@ -32,7 +32,7 @@ from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.considered import Nuisances, nuisance_products
 from calib_ros.estimation.leastsquares import System, products_of
 from calib_ros.estimation.levels import SCALE, SEVERAL, TRIED, chance_of
-from calib_ros.estimation.observations import SOME_POSES, Observations, numbered
+from calib_ros.estimation.observations import SOME_POSES, Observations, frames_of_sets, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER
 from calib_ros.estimation.start import in_new_frames, released
@@ -63,6 +63,7 @@ def recalibrate(
     of angles twice that [rad]. `new` are frames of moved devices and of remounted targets. Raises
     InputError if the calibration has no covariance or lacks a frame, or for a mistake.
     """
+    previous.require_frames(problem.all_sets)
     previous = _released(previous, new)
     ours = [name for name in new if name in problem.chain.frame_names]
     problem = replace(problem, chain=released(problem.chain, ours))
@@ -174,7 +175,7 @@ def _recalibrated(
 
 def _movable(chain: Chain, sets: Sequence[Observations], new: Sequence[str]) -> list[str]:
     """Return the frames of the sets that are neither new nor fixed."""
-    ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
+    ends = frames_of_sets(sets, base=True, tool=True)
     return [end for end in ends if end not in new and not chain.frame(end).fixed]
 
 
@@ -241,7 +242,6 @@ class _Arm:
                 'the earlier calibration has no parameter covariance: identify it again with this '
                 'version, from its own poses'
             )
-        previous.require_frames(sets)
         chain, names, square = previous.chain, previous.names, previous.covariance
         square = square - previous.unmodelled.for_names(names).square
         device = np.zeros_like(square)

@@ -278,12 +278,14 @@ def test_every_setting_is_in_a_group():
     assert sorted(grouped) == sorted(item.name for item in fields(Settings))
 
 
-def seen_by(ends, count, seed):
+def seen_by(ends, count, seed, remounted=False):
     """Return rows of a table of the arm, some for each (device, target), wherever these are."""
     rows = []
     for device, target in ends:
         rng = np.random.default_rng([len(device), len(target)])
         frames = {'base': random_frame(rng, 2.0), 'tool': random_frame(rng, 0.1)}
+        if remounted:
+            frames['tool'] = random_frame(rng, 0.1)
         true = replace(TRUE, **frames)
         made = rows_of(measured(true, count, seed), held_out=0)
         rows += [row | {'device': device, 'target': target} for row in made]
@@ -317,6 +319,17 @@ def test_what_each_device_measures_again_is_judged_in_its_own_frame(of_two, run,
     assert told['lower_mm'] < told['rms_mm'] < told['upper_mm'] < 0.3 < told['before']['rms_mm']
     status, out, _ = run('identify', *judged, '--previous', of_two)
     assert (status, out[:8]) == (0, 'Accepted')
+
+
+@pytest.mark.parametrize('ends', [(VICON,), (VICON, LEICA)])
+def test_new_targets_are_those_that_were_measured(of_two, run, tmp_path, ends):
+    """To both commands: an update freed the first one's frame alone, measured or not."""
+    write_csv(tmp_path / 'new.csv', seen_by(ends, 20, 2, remounted=True))
+    judged = ['new.csv', '--chain', 'ur5e', '--new-tool']
+    status, out, _ = run('verify', *judged, '--calibration', of_two, '--tolerance', '0.3')
+    assert (status, out[:6]) == (0, 'PASS: ')
+    status, out, _ = run('identify', *judged, '--previous', of_two, '--json')
+    assert (status, json.loads(out)['changed']) == (0, [])
 
 
 def test_json_of_a_verdict_alone_is_printed_and_has_no_infinity(of_two, run, tmp_path):
