@@ -4,6 +4,7 @@
 
 import threading
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -215,7 +216,7 @@ def test_a_trajectory_is_corrected(calibrated, monkeypatch):
     calibrated.spin_until(lambda: any('trajectory: too little' in each.msg for each in told))
 
 
-def test_other_joints_and_names_of_the_robot_by_the_last_calibration(tmp_path):
+def test_other_joints_and_names_of_the_robot_by_the_last_calibration(tmp_path, calibrated):
     names = [f'axis_{k}' for k in range(6)]
     with Cell(chain='ur10e', data_dir=str(tmp_path), joint_names=names) as cell:
         heard = corrections(cell)
@@ -233,6 +234,11 @@ def test_other_joints_and_names_of_the_robot_by_the_last_calibration(tmp_path):
             expected = compensate(Compensator(UR, chain), q).joints
             np.testing.assert_allclose(found[:, :0:-1], expected, rtol=0, atol=1e-12)
             assert [len(point.velocities) for point in heard[0].points] == [0] * 5
+        narrow = replace(calibrated.node.session.calibration.region, limit=1e-9)
+        cell.node.session.adopt(Calibration(chain, UR, region=narrow))
+        said = send(cell, trajectory(q, names=names))
+        assert 'refused: 0 of 5 points corrected' in said
+        assert 'not valid in 100 % of the program' in said
 
 
 def test_nothing_is_corrected_without_a_calibration(idle):

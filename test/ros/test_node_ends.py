@@ -179,7 +179,7 @@ def test_a_calibration_that_was_not_saved_is_told_of(journal):
         assert node.close()
         cell.spin_until(lambda: any(UNSAVED in each.msg and each.level == 30 for each in told))
         node = cell.start(**first)
-        cell.done('load')
+        assert 'not saved' not in cell.done('load').message
     assert sum(UNSAVED in each.msg and each.level == 30 for each in told) == 1
 
 

@@ -15,6 +15,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.files.archive import Archive
+from calib_ros.kinematics import se3
 from calib_ros.sampling.session import CalibrationSession
 
 
@@ -32,9 +33,11 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
         cell.spin_until(lambda: [m for m in heard if m.header.stamp == joints[-1].header.stamp])
         message = heard[-1]
         assert message.header.frame_id == 'tracker'
-        true = truth.forward(recording.joints[-1:])[0, :3, 3]
-        point = message.pose.position
-        np.testing.assert_allclose([point.x, point.y, point.z], true, rtol=0, atol=1e-4)
+        true = truth.forward(recording.joints[-1:])[0]
+        point, turn = message.pose.position, message.pose.orientation
+        np.testing.assert_allclose([point.x, point.y, point.z], true[:3, 3], rtol=0, atol=1e-4)
+        found = se3.from_quat(np.array([turn.x, turn.y, turn.z, turn.w]))
+        np.testing.assert_allclose(found, true[:3, :3], rtol=0, atol=1e-3)
         twice = 'dropped joints: same stamp twice'  # the last of them is on its way
         cell.spin_until(lambda: diagnostics and values_of(diagnostics[-1]).get(twice) == '2')
         status = diagnostics[-1].status[0]
@@ -106,8 +109,8 @@ def test_residuals_of_all_devices_are_drawn_in_one_frame(tmp_path, recording, tr
         np.testing.assert_allclose(ends[0] - begins[0], 200.0 * left, atol=1e-9)
         sizes = np.linalg.norm(left, axis=1)
         red = np.minimum(sizes / (3.0 * np.sqrt(np.mean(sizes**2))), 1.0)
-        shown = [(color.r, color.g) for color in lines.colors[: 2 * STOPS : 2]]
-        np.testing.assert_allclose(shown, np.column_stack([red, 1.0 - red]), atol=1e-6)
+        shown = [(color.r, color.g, color.b) for color in lines.colors[: 2 * STOPS : 2]]
+        np.testing.assert_allclose(shown, np.column_stack([red, 1.0 - red, 0.0 * red]), atol=1e-6)
         np.testing.assert_allclose(begins[1], begins[0], atol=5e-4)
 
 
