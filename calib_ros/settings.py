@@ -35,8 +35,8 @@ STARTUP = (
 """Settings that a running node cannot change."""
 
 
-def _setting(default: Any, text: str, lower: float | None = None) -> Any:
-    return field(default=default, metadata={'text': text, 'lower': lower})
+def _setting(default: Any, text: str, lower: float | None = None, upper: float = math.inf) -> Any:
+    return field(default=default, metadata={'text': text, 'lower': lower, 'upper': upper})
 
 
 def effects_of(model: str) -> tuple[str, ...]:
@@ -95,7 +95,7 @@ class Settings:
         0.05, 'distance between the two sockets of a location [m]', 1e-6
     )
     max_gap: float = _setting(
-        0.1, 'longest time between the two joint states that bracket a measurement [s]', 1e-6
+        0.1, 'longest time between the two joint states that bracket a measurement [s]', 1e-6, 60.0
     )
     joint_buffer: int = _setting(
         200_000, 'joint states kept waiting; when full, the older half is dropped', 2
@@ -107,15 +107,20 @@ class Settings:
         'or triggered (one per call of ~/capture)',
     )
     still: float = _setting(
-        5e-4, 'the arm stands still while no joint moves by more [rad or m]', 0.0
+        5e-4, 'the arm stands still while no joint moves by more [rad or m]', 0.0, 0.1
     )
     settle: float = _setting(0.1, 'wait after each stop for vibration to die out [s]', 0.0)
     shortest_stop: float = _setting(0.2, 'shorter stops are ignored [s]', 0.0)
     longest_stop: float = _setting(5.0, 'only this much of a longer stop is used [s]', 0.0)
     lateness: float = _setting(
-        1.0, 'how much later measurements may arrive than joint states of the same stamp [s]', 0.0
+        1.0,
+        'how much later measurements may arrive than joint states of the same stamp [s]',
+        0.0,
+        600.0,
     )
-    delay: float = _setting(0.0, 'known delay of measurement stamps after joint stamps [s]', -10.0)
+    delay: float = _setting(
+        0.0, 'known delay of measurement stamps after joint stamps [s]', -10.0, 10.0
+    )
     sources: tuple[str, ...] = _setting(
         (),
         'measurement topics, each as "TOPIC key=value ..."; keys: type, device, target, '
@@ -123,7 +128,7 @@ class Settings:
     )
     joint_topics: tuple[str, ...] = _setting((), 'joint state topics')
     wanted_accuracy: float = _setting(
-        1e-4, 'wanted standard deviation of predicted positions [m]', 1e-9
+        1e-4, 'wanted standard deviation of predicted positions [m]', 1e-9, 0.05
     )
     frame_id: str = _setting('', 'required frame of the measurements; default: any')
     folds: int = _setting(5, 'number of cross-validation folds', 2)
@@ -176,7 +181,8 @@ class Settings:
         if self.mode not in MODES:
             raise UnknownNameError('mode', self.mode, MODES)
         for item in fields(self):
-            value, lower = getattr(self, item.name), item.metadata['lower']
+            value = getattr(self, item.name)
+            lower, upper = item.metadata['lower'], item.metadata['upper']
             if isinstance(item.default, tuple):  # longer lists would take very long
                 longest = max(map(len, value), default=0)
                 for count, what in ((len(value), 'entries'), (longest, 'characters in an entry')):
@@ -188,6 +194,8 @@ class Settings:
                 raise ConfigError(f'{item.name} must be a finite number, not {value}')
             if lower is not None and value < lower:
                 raise ConfigError(f'{item.name} must be at least {lower}, not {value}')
+            if lower is not None and value > upper:
+                raise ConfigError(f'{item.name} must be at most {upper:g}, not {value:g}')
         for name in ('shortest_stop', 'settle'):
             value = getattr(self, name)
             if value >= self.longest_stop:

@@ -97,12 +97,14 @@ def parse_like(default: Any, value: object, where: str) -> Any:
             return type(default)(number)
         wanted = 'a whole number'
     elif isinstance(default, str):
-        if isinstance(value, str):
+        if isinstance(value, str) and value.isprintable():
             return value
-        raise ConfigError(f'{where} must be text, not {value!r:.100}: write it in quotes')
+        if not isinstance(value, str):
+            raise ConfigError(f'{where} must be text, not {value!r:.100}: write it in quotes')
+        wanted = 'printable text'
     else:
         texts = value if isinstance(value, list | tuple) else (value,)
-        if all(isinstance(each, str) for each in texts):
+        if all(isinstance(each, str) and each.isprintable() for each in texts):
             return tuple(filter(None, texts))
         wanted = "a list of strings such as ['a', 'b']"
     raise ConfigError(f'{where} must be {wanted}, not {value!r:.100}')

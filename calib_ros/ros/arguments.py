@@ -10,6 +10,7 @@ files and node share one list.
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import textwrap
 from ast import literal_eval
@@ -31,13 +32,14 @@ NODE = 'calibration_node'
 
 @dataclass(frozen=True)
 class NodeParameter:
-    """A parameter: default, description, whether it can change, smallest value."""
+    """A parameter: default, description, whether it can change, smallest and largest value."""
 
     name: str
     default: Any
     text: str
     fixed: bool = True
     lower: float | None = None
+    upper: float = math.inf
 
 
 BESIDE_SETTINGS = f"""
@@ -66,7 +68,7 @@ flange_frame ''  flange frame in which the target is published on /tf_static; de
 published
 target_frame 'target'  frame name of the target on /tf_static
 """
-"""Name, `*` if it can change, default, description; numbers are not negative."""
+"""Name, `*` if it can change, default, description; numbers are not negative, shares <= 1."""
 
 
 def _written(line: str) -> NodeParameter:
@@ -74,7 +76,8 @@ def _written(line: str) -> NodeParameter:
     name, default = head.split(' ')
     value = literal_eval(default)
     lower = 0.0 if isinstance(value, float) else None
-    return NodeParameter(name.rstrip('*'), value, text, not name.endswith('*'), lower)
+    upper = 1.0 if 'share of' in text else math.inf
+    return NodeParameter(name.rstrip('*'), value, text, not name.endswith('*'), lower, upper)
 
 
 PARAMETERS = {

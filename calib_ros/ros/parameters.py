@@ -140,7 +140,8 @@ def _declare(node: Node, overrides: Mapping[str, Any], each: NodeParameter) -> A
         span = IntegerRange(from_value=int(each.lower), to_value=int(LARGEST_SETTING))
         descriptor.integer_range = [span]
     elif each.lower is not None:
-        span = FloatingPointRange(from_value=float(each.lower), to_value=LARGEST_SETTING)
+        most = min(each.upper, LARGEST_SETTING)
+        span = FloatingPointRange(from_value=float(each.lower), to_value=most)
         descriptor.floating_point_range = [span]
     given = overrides.get(each.name, each.default)
     value = parse_like(each.default, given, f'parameter "{each.name}"')

@@ -55,6 +55,10 @@ def test_every_parameter_is_in_the_file_with_its_default_and_an_argument_of_laun
         ('priors', ['*.a=much'], 'must be a finite number'),
         ('sigma_position', -1.0, 'sigma_position'),
         ('sigma_position', 1, "expected 'Type.DOUBLE'"),
+        ('frame_id', 'a\nb', "frame_id must be printable text, not 'a\\nb'"),
+        ('still', 5.0, 'Max: 0.1'),  # degrees
+        ('largest_loss', 20.0, 'Max: 1'),  # per cent
+        ('wanted_accuracy', 0.1, 'Max: 0.05'),  # mm
         ('marker_scale', float('nan'), 'marker_scale'),  # the markers would be nowhere
         ('longest_stop', 0.1, 'must be shorter than longest_stop (0.1 s)'),
         ('mode', 'continuous', 'read-only'),
@@ -158,6 +162,12 @@ def test_all_of_an_atomic_change_or_nothing(idle):
         ({'target_filename': '/x.yaml'}, 'choose target_filename in data_dir, or start'),
         ({'calibration_filename': '/x.yaml'}, 'choose calibration_filename in data_dir, or start'),
         ({'settle': 100.0}, 'settle (100 s) must be shorter than longest_stop (5 s)'),
+        ({'lateness': 1e9}, 'lateness out of range Min: 0.0, Max: 600'),
+        ({'delay': 50.0}, 'delay out of range Min: -10.0, Max: 10'),  # ms
+        ({'max_gap': 100.0}, 'max_gap out of range Min: 1e-06, Max: 60'),
+        ({'target_frame': 'a\x07'}, 'parameter "target_frame" must be printable text'),
+        ({'data_dir': '\0'}, 'parameter "data_dir" must be printable text'),
+        ({'sources': ['/p target=\x07']}, 'parameter "sources" must be a list of'),
     ],
 )
 def test_a_wrong_parameter_is_refused_at_the_start(empty, tmp_path, parameters, said):

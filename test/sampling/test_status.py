@@ -69,7 +69,7 @@ def test_the_status_tells_how_far_it_is():
     assert made.status().startswith('waiting for joint states; 6 poses, ')
     assert 'too few to predict how many are needed' in made.status()
     assert 'more' not in made.status()
-    made.change(replace(made.settings, wanted_accuracy=1.0))  # that is what priors say
+    made.change(replace(made.settings, wanted_accuracy=0.05))  # that is what priors say
     assert 'too few to predict how many are needed' in made.status()
     made.restore(samples(60, start=100))
     assert 'mm expected' in made.status()
