@@ -59,7 +59,7 @@ class Collector:
         self.sampler = Sampler(self._revolute, settings.pose_buffer)
         self.dropped = self.sampler.dropped
         self.waiting = Waiting(ROW_WIDTH, settings.pose_buffer, self.dropped, self.sampler.has)
-        self.unused: Counter[str] = Counter()  # measurements normally not used, by cause
+        self.unused: Counter[str] = Counter()  # messages normally not used, by cause
         self.notes: Counter[str] = Counter()
 
     def recent_series(self, now_ns: int | None) -> tuple[Series, list[Series]]:
@@ -278,7 +278,8 @@ class Collector:
         found = [(JOINTS, self.track.sort())]  # image numbers always differ
         found += [(POSES, rows.sort(one=key.images)) for key, rows in self.waiting.items()]
         for kind, (equal, contrary) in found:
-            self.dropped += Counter({f'{kind}: {TWICE}': equal, f'{kind}: {CONTRARY}': contrary})
+            self.unused += Counter({f'{kind}: {TWICE}': equal})
+            self.dropped += Counter({f'{kind}: {CONTRARY}': contrary})
 
     def _plan_stops(
         self, plan: Schedule, until: int, rounds: Sequence[int], ends_here: bool

@@ -38,7 +38,7 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
         np.testing.assert_allclose([point.x, point.y, point.z], true[:3, 3], rtol=0, atol=1e-4)
         found = se3.from_quat(np.array([turn.x, turn.y, turn.z, turn.w]))
         np.testing.assert_allclose(found, true[:3, :3], rtol=0, atol=1e-3)
-        twice = 'dropped joints: same stamp twice'  # the last of them is on its way
+        twice = 'not used joints: same stamp twice'  # the last of them is on its way
         cell.spin_until(lambda: diagnostics and values_of(diagnostics[-1]).get(twice) == '2')
         status = diagnostics[-1].status[0]
         assert (status.name, status.hardware_id) == ('calibration_node: calibration', 'A7')

@@ -199,7 +199,7 @@ def test_a_pair_that_repeats_is_one_measurement(tmp_path, rng):
     found, session = poses_of(record(tmp_path / 'bag', events(rng, moving)))
     assert len(found) == 2
     assert session.account().poses == 5
-    assert session.account().dropped == {'measurements: same stamp twice': 3}
+    assert session.account().unused == {'measurements: same stamp twice': 3}
 
 
 @pytest.mark.parametrize('big_endian', [False, True])
