@@ -260,8 +260,8 @@ class MessageFilter:
             places, _, (_, *names), stamps, numbers = part
             self._names.hear(names, numbers)
             columns, index, fault = self._names.layout(names)
-            if numbers.shape[1] != len(names):
-                fault = fault or (UNEVEN if numbers.size else NO_VALUES)
+            if numbers.shape[1] != len(names) and not (fault and names):
+                fault = UNEVEN if numbers.size else NO_VALUES
             if fault == NO_VALUES:
                 self._names.blank.update(columns)
                 if self.latest and stamps[-1] - self.latest[0] > 1e9 * SILENCE:

@@ -203,6 +203,7 @@ def test_joint_states_without_positions_are_those_of_others_if_the_arm_sends_som
     assert made.status().startswith(
         'waiting for joint states with positions: none came of wrist_1_joint, wrist_2_joint, '
     )
+    assert 'refused, names and positions differ in number' in named(([], [0.1] * 6)).status()
     made = named((UR5E.joint_names, [0.1] * 6))  # and a driver may send none later
     take(made, of_joints(joint_state(10**18 + 6 * 10**9, *efforts)))
     assert 'joint states are refused, no positions in the message' in made.status()
