@@ -169,8 +169,8 @@ class Inference:
         found = columns.posterior(evidence, size)
         evidence.widen(size)
         shift, covariance = columns.averaged(evidence, near)
-        matrix, precision = columns.about_nominal(sums.plain)[0], evidence.precision(size)
-        device = _device(matrix, sums.cross[:-1], sums.doubtful, precision, columns.arm.stop)
+        precision, count = evidence.precision(size), columns.arm.stop
+        device = _device(sums.plain[:-1, :-1], sums.cross[:-1], sums.doubtful, precision, count)
         found = replace(found, shift=shift, covariance=covariance, device=device)
         return found if self.fitted.held is None else found.held_at(*self.fitted.held)
 
@@ -215,9 +215,13 @@ class _Columns:
         whole, lengths, self.scale = self.chain, dict[str, float](), SCALE
         if more:
             whole, lengths, self.scale = lengths_of(self.chain, system)
-        nuisances = Nuisances(beside, lengths, bool(more), Unmodelled(waves=waves), kept=True)
         noise = max(given.noise, ROUNDING)  # parameters that follow all exactly leave none
-        self.sums = _sums_of(fitted, whole, self.names, nuisances, noise)
+        if more or beside or waves:
+            nuisances = Nuisances(beside, lengths, bool(more), Unmodelled(waves=waves), kept=True)
+            self.sums = nuisance_products(whole, self.names, system, nuisances, noise)
+        else:
+            plain = fitted.products / noise**2
+            self.sums = NuisanceProducts(plain, plain[:, :0], plain[:0, :0])
         self.scaled, count = bool(lengths), len(self.sums.plain) - 1
         self.arm = slice(0, count - self.scaled)  # with waves, in units of their size
         self.offsets = np.append(fitted.offsets, np.zeros(count - len(names)))
@@ -253,25 +257,15 @@ class _Columns:
         """Return the mean (P,) from the fit and the covariance (P, P), for weighted log sizes."""
         weights, tried = zip(*near, strict=True)
         matrix, vector = (each[self.arm] for each in self.about_nominal(self.sums.plain))
-        precisions = [evidence.precision(each)[self.arm] for each in tried]
-        each_alone = [solved(matrix[:, self.arm], vector, each) for each in precisions]
-        mean, covariance = mixed(each_alone, weights)
+        wide = evidence.precision(np.array(tried))[:, self.arm]
+        alone = [solved(matrix[:, self.arm], vector, each) for each in wide]
+        mean, covariance = mixed(alone, weights)
         return mean - self.offsets[self.arm], covariance
 
     def about_nominal(self, products: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the normal equations (K, K), (K,) of all offsets from products of their rows."""
         matrix = products[:-1, :-1]
         return matrix, matrix @ self.offsets + products[:-1, -1]
-
-
-def _sums_of(
-    fitted: Fitted, whole: Chain, every: Sequence[str], nuisances: Nuisances, noise: float
-) -> NuisanceProducts:
-    """Return the products of columns for noise of a size, of the fit if without nuisances."""
-    if nuisances.by_device or nuisances.sizes or nuisances.unmodelled.waves:
-        return nuisance_products(whole, every, fitted.system, nuisances, noise)
-    products = fitted.products / noise**2
-    return NuisanceProducts(products, products[:, :0], products[:0, :0])
 
 
 def _device(
