@@ -59,12 +59,8 @@ def problem_of(name, session, chain_name):
 
 def changed(problem, change):
     """Return a problem with all its observations changed."""
-    return replace(
-        problem,
-        observations=change(problem.observations),
-        more=tuple(map(change, problem.more)),
-        held_out=tuple(map(change, problem.judging)),
-    )
+    judging = tuple(map(change, problem.judging))
+    return problem.with_sets(map(change, problem.sets), held_out=judging)
 
 
 def joints(change):
@@ -112,7 +108,7 @@ def mixed_up(problem):
         names = ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented')
         whole = {n: np.concatenate([getattr(e, n) for e in parts])[order] for n in names}
         sets.append(later(replace(each, **whole, covariance=None, delay=None)))
-    return replace(problem, observations=sets[0], more=tuple(sets[1:]), held_out=None)
+    return problem.with_sets(sets, held_out=None)
 
 
 def spoilt(problem):

@@ -67,7 +67,7 @@ def uneven(problem: Problem, result: Identification) -> tuple[str, Problem] | No
         if each.velocity is not None:
             joints[:, own] += each.velocity[:, own] * np.einsum('k,knl->nl', sizes, modes(each))
         sets.append(replace(each, joints=joints))
-    return text, replace(problem, observations=sets[0], more=sets[1:])
+    return text, problem.with_sets(sets)
 
 
 def _explained(
@@ -80,8 +80,7 @@ def _explained(
     """Return the share of the residual squares by K delays, their sizes and effects (K,)."""
     few, count = [each.spread() for each in problem.sets], len(result.names)
     few = [replace(s, approach=None if s.velocity is None else rate(s.velocity)) for s in few]
-    chain = result.chain.with_effects(lags)
-    rows = problem.system(few).rows_of(chain, [*result.names, *lags])
+    rows = problem.system(few).rows_of(result.chain.with_effects(lags), [*result.names, *lags])
     for k, each in enumerate(few):
         added = np.einsum('knl,lcn->kcn', modes(each), rows[k][count:-1])
         rows[k] = np.concatenate([rows[k][:count], added, rows[k][-1:]])

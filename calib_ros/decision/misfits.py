@@ -140,7 +140,7 @@ def zero_of_distances(fitted: Fitted) -> tuple[Reason, ...]:
         found += offset
         sets = list(problem.sets)
         sets[wires[0]] = _lengthened(sets[wires[0]], -found)
-        fitted = fit(replace(problem, observations=sets[0], more=tuple(sets[1:])))
+        fitted = fit(problem.with_sets(sets))
     if not found:
         return ()
     remedy = 'correct the zero where they are published'

@@ -125,9 +125,9 @@ def _sessions(problem: Problem, result: Identification) -> str:
     if len(sessions) < 2 or moved:
         return ''
     worst = 0.0
-    for first, *more in (map(Observations.some_images, s) for s in sessions):
+    for session in sessions:
         try:
-            alone = fit(replace(problem, observations=first, more=more, held_out=()))
+            alone = fit(problem.with_sets(map(Observations.some_images, session), held_out=()))
         except (CalibrationError, np.linalg.LinAlgError):
             return ''  # too few to tell, or without what an effect needs
         worst = max(worst, alone.noise.position)
@@ -255,9 +255,8 @@ def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | 
     """
     if any(each.pixels is not None for each in problem.sets):
         return None
-    first, *more = map(_with_moves, problem.sets)
     bases = sorted({each.base for each in problem.sets})
-    late, chain = replace(problem, observations=first, more=more), result.chain
+    late, chain = problem.with_sets(map(_with_moves, problem.sets)), result.chain
     for name in bases:
         chain = chain.with_frame(name, replace(chain.frame(name), delay=0.0))
     delays = [Parameter(name, DELAY) for name in bases]

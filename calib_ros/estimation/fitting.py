@@ -123,8 +123,7 @@ def _thin_problem(
     share = -(-sum(map(len, problem.sets)) // (2 * SOME))
     if simpler is None or share < 2:
         return problem, simpler
-    first, *more = (each.select(np.arange(0, len(each), share)) for each in problem.sets)
-    few = replace(problem, observations=first, more=more)
+    few = problem.with_sets(s.select(np.arange(0, len(s), share)) for s in problem.sets)
     return few, replace(simpler, distances=tuple(each[::share] for each in simpler.distances))
 
 
@@ -147,9 +146,8 @@ def _fit(
     fit = robust.fit
     factor = factor_of(fit.chain, names, robust.system, fit.normal)
     noise, uncertainty = noise_of(fit, names, robust.system, factor)
-    noise = replace(noise, given=problem.sigmas)
-    found = robust, factor, noise, uncertainty, noise.size
-    return Fitted(problem, structural, start, names, *found)
+    found = factor, replace(noise, given=problem.sigmas), uncertainty, noise.size
+    return Fitted(problem, structural, start, names, robust, *found)
 
 
 def _noise_for_priors(noise: Noise, simpler: SimplerFit | None) -> float:

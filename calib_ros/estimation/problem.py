@@ -5,9 +5,10 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -187,6 +188,11 @@ class Problem(Shown):
     def sets(self) -> tuple[Observations, ...]:
         """Return all sets to fit."""
         return (self.observations, *self.more)
+
+    def with_sets(self, sets: Iterable[Observations], **changes: Any) -> Problem:
+        """Return the problem with other sets to fit, and other changed fields."""
+        first, *more = sets
+        return replace(self, observations=first, more=more, **changes)
 
     @cached_property
     def judging(self) -> tuple[Observations, ...]:

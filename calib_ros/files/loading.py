@@ -49,11 +49,8 @@ class Loaded:
     def between(self, names: Mapping[str, str]) -> Problem:
         """Return the problem with renamed frames."""
         problem = self.problem
-        first, *more = (each.between(names) for each in problem.sets)
-        return replace(
-            problem,
-            observations=first,
-            more=more,
+        return problem.with_sets(
+            [each.between(names) for each in problem.sets],
             held_out=[each.between(names) for each in problem.judging],
             separations=[(names.get(a, a), names.get(b, b), d) for a, b, d in problem.separations],
         )

@@ -123,13 +123,10 @@ def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Pro
     for number, pose in (places[k] for k in order[:TRIED].tolist()):
         rest = list(sets)
         rest[number] = rest[number].select(np.arange(len(rest[number])) != pose)
-        one, *more = (each for each in rest if len(each))
-        left = {each.base for each in (one, *more)}
+        kept = [each for each in rest if len(each)]
+        left = {each.base for each in kept}
         apart = tuple(pair for pair in problem.separations if {*pair[:2]} <= left)
-        without = replace(
-            problem, observations=one, more=tuple(more), held_out=None, separations=apart
-        )
-        yield number, pose, without
+        yield number, pose, problem.with_sets(kept, held_out=None, separations=apart)
 
 
 @np.errstate(over='raise', invalid='raise')

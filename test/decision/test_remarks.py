@@ -107,6 +107,7 @@ class Posed:
     observations: object = None
     more: object = ()
     held_out: object = None
+    with_sets = Problem.with_sets
 
 
 @pytest.mark.parametrize(

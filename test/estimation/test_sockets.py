@@ -91,10 +91,10 @@ def test_poses_outside_the_socket_are_named_and_do_no_harm(request, seed, agree)
         sets.append(replace(each, joints=q))
         good.append(each.select(np.setdiff1d(np.arange(len(each)), beside)))
         wrong |= {(number, sample) for sample in beside.tolist()}
-    result = identify(replace(problem, observations=sets[0], more=sets[1:]))
+    result = identify(problem.with_sets(sets))
     assert result.accepted
     assert {(outlier.set, outlier.sample) for outlier in result.outliers} == wrong
-    best = fitted(replace(problem, observations=good[0], more=good[1:], loss='none'))
+    best = fitted(problem.with_sets(good, loss='none'))
     assert difference(result.chain, true) < 1.1 * difference(best.chain, true)
 
 
@@ -150,7 +150,7 @@ def test_known_distances_that_the_arm_does_not_keep_are_no_step(slip):
     for each in problem.sets:
         q = each.joints - 1e-3 * np.sin(each.joints)
         sets.append(replace(each, joints=q + slip * late * (np.arange(7) == 3)))
-    problem = replace(problem, observations=sets[0], more=sets[1:], separations=apart)
+    problem = problem.with_sets(sets, separations=apart)
     step = identify(problem).step
     assert (step and (step.what, step.sample)) == (('joint_4', 15) if slip else None)
 
@@ -213,7 +213,7 @@ def test_a_socket_without_any_pair_is_named():
     _, problem = cell(0)
     nothing = problem.sets[3].select(np.zeros(0, dtype=int))
     with pytest.raises(InputError, match='base_1_1'):
-        identify(replace(problem, more=(*problem.sets[1:3], nothing, *problem.sets[4:])))
+        identify(problem.with_sets((*problem.sets[:3], nothing, *problem.sets[4:])))
 
 
 @pytest.mark.parametrize('scale', [1.0, 1.003])
