@@ -129,8 +129,8 @@ def verify(
     `tolerance`, the largest acceptable RMS position error [m], the verdict is whether the
     calibration holds, by `Calibration.limit`. `progress` receives the share done.
 
-    With `new_base` the measuring device was moved, with `new_tool` the target replaced. Fitting
-    their frames absorbs the errors of two configurations and of one (on the flange, one and two).
+    With `new_base` the measuring devices were moved, with `new_tool` the targets replaced. Fitting
+    a frame absorbs the errors of two configurations, or of one (on the flange: of one, or two).
 
     `commanded` (M, n) are joint values [rad or m] of the uncorrected program: the nominal arm
     defines the wanted poses there. Each measurement belongs to one of them, as it is or corrected.
@@ -141,7 +141,8 @@ def verify(
     _check(arm, sets, fitted)
     comparison, left, uncorrected, chain = _compared(arm, sets, commanded, fitted)
     progress(2 / 3)
-    lost = new_base + new_tool + (new_tool if all(each.seen for each in sets) else new_base)
+    whole = 'tool' if all(each.seen for each in sets) else 'base'
+    lost = len(fitted) + sum(name.startswith(whole) for name in fitted)
     if (count := count_distinct(comparison.before.configurations)) - lost < NEEDED:
         were, more = 'pose was' if count == 1 else 'poses were', NEEDED + lost
         of_frames = f', {lost} of them for the refitted frames' if lost else ''

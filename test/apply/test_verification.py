@@ -363,16 +363,17 @@ def test_a_session_is_judged_without_a_tolerance(arm, cell):
         assert f'poses like these is {rounded(1e3 * found.rms)} mm (' in in_words(found)
 
 
-def test_the_fitted_frame_costs_its_freedom(arm):
-    """Errors that are noise alone: their size is found, though a frame was fitted to them."""
-    rng = np.random.default_rng(3)
-    squares = [
-        verify(
-            arm, [with_errors(arm, rng.normal(scale=1e-4, size=(7, 3)))], 0.1, new_base=True
-        ).rms
-        ** 2
-        for _ in range(100)  # the figure is known by 2 %
-    ]
+@pytest.mark.parametrize('devices', [['base'], ['base', 'base_2']])
+def test_the_fitted_frame_costs_its_freedom(arm, devices):
+    """Errors that are noise alone: their size is found, though frames were fitted to them."""
+    rng, squares = np.random.default_rng(3), []
+    both = ((name, getattr(arm, name)) for name in ('chain', 'before'))
+    known = replace(arm, **{name: each.with_frame('base_2', each.base) for name, each in both})
+    for _ in range(100):  # the figure is known by 2 %
+        seen = with_errors(arm, rng.normal(scale=1e-4, size=(7 * len(devices), 3)))
+        parts = np.split(np.arange(len(seen)), len(devices))
+        sets = [replace(seen.select(k), base=name) for k, name in zip(parts, devices, strict=True)]
+        squares.append(verify(known, sets, 0.1, new_base=True).rms ** 2)
     assert np.sqrt(np.mean(squares)) == pytest.approx(1e-4 * np.sqrt(3.0), rel=0.06)
 
 
