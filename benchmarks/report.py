@@ -29,10 +29,10 @@ from browser import browser
 from calib_ros.apply import simulation
 from calib_ros.cli.main import main as calib_ros
 from calib_ros.estimation.problem import Problem
+from calib_ros.files.loading import Loaded
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.page import Origin, render
-from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
 
 SIZES = (500, 20_000, 500_000)
@@ -59,7 +59,7 @@ def page_of(count: int) -> tuple[str, float, float]:
     start = time.process_time()
     result = identify(problem)
     middle = time.process_time()
-    report = identification_report(problem, result, poses_of(problem, result), Origin())
+    report = identification_report(Loaded(problem, {}), result, Origin())
     text = render(report) or ''
     return text, middle - start, time.process_time() - middle
 

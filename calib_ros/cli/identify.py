@@ -343,9 +343,7 @@ def result_files(
         contents['before_after.png'] = before_after_png(result)
         work('report.html, 3 of 3')
         work(2 / 3)
-        report = reports.identification_report(
-            loaded.problem, result, poses, found.origin, loaded.warnings, found.wanted
-        )
+        report = reports.identification_report(loaded, result, found.origin, found.wanted, poses)
         contents['report.md'] = markdown(report, loaded.samples)
         contents |= inputs.page_of(report, screen, pdf=pdf)
     if result.accepted:

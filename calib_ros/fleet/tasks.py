@@ -7,7 +7,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
@@ -23,7 +23,6 @@ from calib_ros.fleet.plant import Robot
 from calib_ros.identification.age import measured_at
 from calib_ros.report.documents import configuration_yaml
 from calib_ros.report.page import Origin, render
-from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
 from calib_ros.sampling.session import CalibrationSession
 
@@ -110,9 +109,9 @@ def work(task: Task) -> Outcome:
     return outcome._replace(seconds=time.monotonic() - begin)
 
 
-def _named(task: Task, path: Path | None, told: Sequence[str]) -> list[str]:
+def _named(task: Task, path: Path | None, told: Sequence[str]) -> tuple[str, ...]:
     """Return what is told of a source with its name, not that of the copy."""
-    return [words.replace(str(path), task.source.url) if path else words for words in told]
+    return tuple(words.replace(str(path), task.source.url) if path else words for words in told)
 
 
 def _outcome(task: Task, path: Path) -> Outcome:
@@ -128,18 +127,17 @@ def _outcome(task: Task, path: Path) -> Outcome:
     else:
         session = CalibrationSession(chain, settings)
         loaded = load_bag(session, replay(path, session), robot.largest_loss)
-    problem, result = loaded.problem, loaded.identified(settings.model)
-    warnings = _named(task, path, loaded.warnings)
-    time_of = measured_at(problem.all_sets, source.modified)
+    result = loaded.identified(settings.model)
+    loaded = replace(loaded, warnings=_named(task, path, loaded.warnings))
+    time_of = measured_at(loaded.problem.all_sets, source.modified)
     known = (content, robot.settings_hash, source.name, source.fingerprint)
-    row = rows.result_row(result, rows.Filing(robot.serial, time_of, *known), warnings)
+    row = rows.result_row(result, rows.Filing(robot.serial, time_of, *known), loaded.warnings)
     if not task.page:
         return Outcome(row)
     configuration = configuration_yaml(chain.name, settings)
     origin = Origin(inputs, serial=robot.serial, settings=configuration)
     wanted = None if robot.tolerance is None else 1e-3 * robot.tolerance
-    poses = poses_of(problem, result, loaded.by_line)
-    report = identification_report(problem, result, poses, origin, warnings, wanted)
+    report = identification_report(loaded, result, origin, wanted)
     return Outcome(row, page=render(report, f'../../{PLOTLY}') or '')
 
 

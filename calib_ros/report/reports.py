@@ -17,6 +17,7 @@ from calib_ros.decision.result import Identification
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
+from calib_ros.files.loading import Loaded
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.linear_model import COMPARED
 from calib_ros.kinematics.chain_file import table_hash
@@ -25,7 +26,7 @@ from calib_ros.report import figures, sections, words
 from calib_ros.report.advice import FAR, GOOD_ARM, GOOD_HERE, SPREAD_OUT, Advice, Situation, advice
 from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Headline, Origin, Report, Section, section
-from calib_ros.report.poses import Poses
+from calib_ros.report.poses import Poses, poses_of
 from calib_ros.settings import Settings
 from calib_ros.shown import counted, sentence, some
 
@@ -47,15 +48,15 @@ SURVEYED = 20 * SOME_POSES  # random poses of the error map: several per cell
 
 
 def identification_report(
-    problem: Problem,
+    loaded: Loaded,
     result: Identification,
-    poses: Poses,
     origin: Origin,
-    warnings: Sequence[str] = (),
     tolerance: float | None = None,
+    poses: Poses | None = None,
 ) -> Report:
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
-    judged = result.validation or result.fitted
+    problem, judged = loaded.problem, result.validation or result.fitted
+    poses = poses or poses_of(problem, result, loaded.by_line, loaded.images)
     reasons = advice_of(result)
     text = filter(None, _text(result, reasons, tolerance))
     gain = sections.gain(judged)
@@ -86,7 +87,7 @@ def identification_report(
         ),
         picture=sections.distribution(poses),
         steps=_steps(result, reasons, tolerance),
-        remarks=tuple(map(sentence, (*warnings, *notes))),
+        remarks=tuple(map(sentence, (*loaded.warnings, *notes))),
         identity=sections.identity_of(
             result.chain,
             origin,

@@ -197,7 +197,7 @@ class Identifying:
             if self._session.calibration is not None:
                 self.last += '; the last good calibration stays in use'
             self._keep_report(page)
-        row = partial(result_row, result)
+        row = partial(result_row, result, warnings=loaded.warnings)
         self.last += self._filer.file(lambda: loaded.problem, given.settings, row)
         return result.accepted, self.last
 
@@ -254,12 +254,9 @@ def _without_middle(before: str, advice: str, longest: int) -> str:
 
 def _page(given: Snapshot, result: Identification) -> str | None:
     from calib_ros.report.page import Origin, render
-    from calib_ros.report.poses import poses_of
     from calib_ros.report.reports import identification_report
 
     journal, serial = given.origin['journal'], given.origin['robot_serial']
     files = inputs_of(Path(journal) if journal else None)
     origin = Origin(files, serial=serial, settings=given.configuration)
-    problem, warnings = given.loaded.problem, given.loaded.warnings
-    poses = poses_of(problem, result)
-    return render(identification_report(problem, result, poses, origin, warnings))
+    return render(identification_report(given.loaded, result, origin))

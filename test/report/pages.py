@@ -9,8 +9,8 @@ import numpy as np
 from measured import TEST, TRAIN, UR, measured
 
 from calib_ros.estimation.problem import Problem
+from calib_ros.files.loading import Loaded
 from calib_ros.report.page import Origin, render
-from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
 
 
@@ -49,9 +49,8 @@ def problem_of(count=TRAIN, chain=UR, **more):
     return Problem(chain, rows.select(np.arange(count)), held_out, **more)
 
 
-def report_of(problem, result, **more):
-    poses = poses_of(problem, result)
-    return identification_report(problem, result, poses, Origin(), **more)
+def report_of(problem, result, warnings=(), tolerance=None):
+    return identification_report(Loaded(problem, {}, warnings), result, Origin(), tolerance)
 
 
 def page_of(report):

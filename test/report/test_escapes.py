@@ -15,13 +15,13 @@ from measured import measured
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.export import exports
 from calib_ros.files.journal import Journal, read_journal
+from calib_ros.files.loading import Loaded
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.report import reports
 from calib_ros.report.page import Origin, markdown, with_code
 from calib_ros.report.plots import before_after_png
-from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
 from calib_ros.sampling.sample import Sample
 from calib_ros.texts import from_cell, in_markdown, one_line, to_cell
@@ -88,7 +88,6 @@ def test_a_report_is_of_one_form_whatever_the_names(result, monkeypatch):
     """Of the robot, a joint, what was dropped, and in a warning."""
     monkeypatch.setattr(reports, 'SURVEYED', 100)
     problem = Problem(load_chain('ur5e'), measured())
-    poses = poses_of(problem, result)
 
     def lines_of(name):
         first = replace(result.parameters[0], name=Parameter(name, 'a'))
@@ -97,7 +96,7 @@ def test_a_report_is_of_one_form_whatever_the_names(result, monkeypatch):
             chain=replace(result.chain, name=name),
             parameters=(first, *result.parameters[1:]),
         )
-        report = identification_report(problem, found, poses, Origin(), (name,))
+        report = identification_report(Loaded(problem, {}, (name,)), found, Origin())
         return markdown(report, {'samples': 3, 'dropped': {name: 1}}).splitlines()
 
     usual = lines_of('x')

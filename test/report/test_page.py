@@ -19,6 +19,7 @@ from calib_ros import Calibration, Problem, identify, verify
 from calib_ros.apply import simulation
 from calib_ros.apply.workspace import survey
 from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.files.loading import Loaded
 from calib_ros.files.rows import Input
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice, page
@@ -129,15 +130,13 @@ def test_what_others_named_is_text(solved):
     problem = problem_of(chain=chain)
     result = identify(problem)
     origin = Origin((Input(HOSTILE, 1, HOSTILE),), HOSTILE, HOSTILE, HOSTILE, HOSTILE)
-    poses = poses_of(problem, result)
-    text = render(identification_report(problem, result, poses, origin, warnings=(HOSTILE,)))
+    text = render(identification_report(Loaded(problem, {}, (HOSTILE,)), result, origin))
     page = Page(text)
     assert [tag for tag, _ in page.tags if tag == 'script'] == ['script'] * 3
     assert not [1 for _, attributes in page.tags if 'onclick' in attributes]
     assert page.text.count('alert(1)') > 10
     told = Origin((Input('a', 1, 'b'),), 'c', 'd', 'e', 'f')
-    poses = poses_of(*solved)
-    plain = identification_report(*solved, poses, told, warnings=('g',))
+    plain = identification_report(Loaded(solved[0], {}, ('g',)), solved[1], told)
     plain = replace(plain, advice=advice.advice([Reason(Rule.GAIN, 'h'), Reason(Rule.DRIFT, 'i')]))
     assert {tag for tag, _ in page.tags} <= {tag for tag, _ in page_of(plain).tags}
     shown = json.dumps(page.data['figures'])

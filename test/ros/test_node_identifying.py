@@ -24,6 +24,7 @@ from calib_ros.ros.arguments import NODE
 from calib_ros.ros.boundary import InOrder
 from calib_ros.ros.identifying import ONE_BEFORE
 from calib_ros.ros.outputs import Keeper
+from calib_ros.sampling.session import CalibrationSession
 
 
 @pytest.fixture
@@ -121,6 +122,19 @@ def test_messages_are_taken_while_a_judgement_is_filed(tmp_path, recording, monk
         cell.spin_until(judging.done)
         assert f'{STOPS} poses' in judging.result().message
         assert [row.kind for row in rows] == ['validate']
+
+
+def test_warnings_of_the_measurements_are_filed_too(tmp_path, recording, monkeypatch):
+    """As by `identify` and `fleet`."""
+    rows = []
+    monkeypatch.setattr(History, 'file', lambda history, row: rows.append(row))
+    monkeypatch.setattr(CalibrationSession, 'warnings', ('the clocks differ',))
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': '7'}
+    with Cell(**parameters, history=str(tmp_path / 'history')) as cell:
+        cell.play(topics(recording))
+        cell.done('identify')
+    (row,) = rows
+    assert row.remarks[0] == 'the clocks differ'
 
 
 @pytest.mark.parametrize(
