@@ -44,7 +44,7 @@ from real_robots import DATA, problem_of
 from calib_ros.apply import planning
 from calib_ros.apply.candidates import Visibility, draw_candidates
 from calib_ros.apply.design import Candidates, Design, accuracy, predicted
-from calib_ros.apply.planning import choose
+from calib_ros.apply.planning import Choice
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.apply.workspace import place
 from calib_ros.estimation.problem import Problem
@@ -114,9 +114,9 @@ def speed():
         return set(np.array(found).tolist())
 
     for _ in range(3):
-        ours = timed('choose_d', lambda: choose(design, candidates, 30))
+        ours = timed('choose_d', lambda: Choice(design, candidates).best(30))
         theirs = timed('naive_d', lambda: naive(design, candidates, 30))
-    timed('choose_o5', lambda: choose(design, candidates, 30, 'o5'))
+    timed('choose_o5', lambda: Choice(design, candidates, 'o5').best(30))
     true = faulty(chain, Cell(), rng)
     arm = Calibration.of(identify(Problem(chain, measure(true, candidates[:60], rng, *SIGMAS))))
     postures = chain.random_joints(10000, rng)
@@ -171,7 +171,7 @@ def simulated(arm, oriented, draws):
         candidates = draw(2000, rng)
         row = {}
         for criterion in ('d', 'task'):
-            chosen = choose(design, candidates, 25, criterion, unseen)
+            chosen = Choice(design, candidates, criterion, unseen).best(25)
             row[criterion] = float(
                 np.mean(
                     [
@@ -180,7 +180,7 @@ def simulated(arm, oriented, draws):
                     ]
                 )
             )
-        share = planning.efficiency(design, candidates, chosen, unseen)
+        share = Choice(design, candidates, 'task', unseen).efficiency(chosen)
         least = accuracy(design, candidates[chosen], unseen)[-1] * np.sqrt(share)
         row['bound'] = 1e3 * float(least)
         for count in (25, 50):
@@ -271,7 +271,7 @@ def measured(name, session, tracker, draws):
 
     row = {'rows': len(joints), 'all_mm': rms(full)}
     for label, count in (('half', len(joints) // 2), ('30', 30)):
-        chosen = choose(design, joints, count)
+        chosen = Choice(design, joints).best(count)
         planned = fitted_to(chosen)
         random = [rms(fitted_to(rng.permutation(len(joints))[:count])) for _ in range(draws)]
         row[f'{label}_mm'] = rms(planned)

@@ -18,13 +18,13 @@ are undefined while M is singular: exchanges then start from the choice by `d`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy import linalg
 
-from calib_ros.annotated import Count, NotNegative, as_annotated
+from calib_ros.annotated import Count, NotNegative, as_annotated, check_fields
 from calib_ros.apply.candidates import travel_times, visit_order
 from calib_ros.apply.design import (
     Candidates,
@@ -47,37 +47,67 @@ from calib_ros.shown import Shown, as_frame, rounded
 INDICES: tuple[Criterion, ...] = ('o2', 'o3', 'o4', 'o5')
 
 
-@as_annotated
-def choose(
-    design: Design,
-    candidates: FloatArray,
-    count: Count,
-    criterion: Criterion = 'd',
-    task: FloatArray | None = None,
-    apart: NotNegative = STILL,
-    progress: Notify = quiet,
-    start: Index | None = None,
-    exchanged: bool = True,
-) -> Index:
-    """Choose poses to measure among candidates (N, n) [rad or m].
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """What poses to measure are chosen from, and by what; as in `plan`."""
 
-    Returns the indices (count,) of the chosen poses, the most informative first. The criterion
-    `task` needs joint values (T, n) at which the arm must be accurate. Any two poses differ by at
-    least `apart` [rad or m] in the joint that moves most. Exchanges start at `start`, indices
-    (count,), if known; a quick choice skips them.
-    """
-    space = Candidates(design, candidates)
-    worth = _Worth(space, criterion, task)
-    first = worth if criterion == 'task' else _Worth(space, 'd')
-    pick = _Pick(space, apart)
-    progress(f'{count} poses')
-    for k in range(count):
-        pick.add(pick.best(first) if start is None else int(start[k]))
-    rounds = 1
-    while exchanged and pick.exchange(worth):
-        rounds += 1
-        progress(f'{count} poses, exchange {rounds}')
-    return pick.in_order(first)
+    design: Design
+    candidates: FloatArray
+    criterion: Criterion = 'd'
+    task: FloatArray | None = None
+    apart: NotNegative = STILL
+    progress: Notify = quiet
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @cached_property
+    def _first(self) -> _Worth:
+        space = Candidates(self.design, self.candidates)
+        return _Worth(space, 'task' if self.criterion == 'task' else 'd', self.task)
+
+    @as_annotated
+    def best(self, count: Count) -> Index:
+        """Return the indices (count,) of the chosen poses, the most informative first."""
+        return self.exchanged(self.quick(count))
+
+    def quick(self, count: int) -> Index:
+        """Return the indices (count,) of poses chosen one by one, without exchanges."""
+        self.progress(f'{count} poses')
+        pick = _Pick(self._first.space, self.apart)
+        for _ in range(count):
+            pick.add(pick.best(self._first))
+        return pick.in_order(self._first)
+
+    def exchanged(self, chosen: Index) -> Index:
+        """Return the indices (K,) of poses after exchanges, the most informative first."""
+        worth = _Worth(self._first.space, self.criterion, self.task)
+        pick = _Pick(self._first.space, self.apart)
+        for index in chosen.tolist():
+            pick.add(index)
+        rounds = 1
+        while pick.exchange(worth):
+            rounds += 1
+            self.progress(f'{len(chosen)} poses, exchange {rounds}')
+        return pick.in_order(self._first)
+
+    def efficiency(self, chosen: Index) -> float:
+        """Return a lower bound of the quality of poses (K,) relative to the best of that number.
+
+        For the criteria `d` and `task`, as a share of poses: with 0.9 even the best choice would
+        need 90 % of them. Both criteria are convex, and the tangent at the choice (Kiefer and
+        Wolfowitz 1960) bounds the gain of the candidates with the steepest slopes.
+        """
+        space = self._first.space
+        ridge = HALF_THE_DIGITS * np.eye(len(space.known))
+        root = _root(space.known + information_of(space.rows[chosen]) + ridge)
+        slope = root @ root.T
+        if self._first.wanted is not None:
+            slope = slope @ self._first.wanted @ slope
+        each = space.traces(slope)
+        start = float(np.sum(slope * space.known))
+        steepest = np.sort(each)[-len(chosen) :]
+        return float((start + each[chosen].sum()) / (start + steepest.sum()))
 
 
 class _Pick:
@@ -145,20 +175,18 @@ class _Pick:
 class _Worth:
     """Worth of candidates by a criterion."""
 
-    def __init__(
-        self, space: Candidates, criterion: Criterion, task: FloatArray | None = None
-    ) -> None:
-        self._criterion, self._space, self._wanted = criterion, space, None
+    def __init__(self, space: Candidates, criterion: Criterion, task: FloatArray | None) -> None:
+        self._criterion, self.space, self.wanted = criterion, space, None
         if criterion == 'task':
             if task is None:
                 raise ConfigError('the criterion "task" needs the poses of a task')
-            self._wanted = space.of_task(task)
+            self.wanted = space.of_task(task)
 
     def of(self, information: FloatArray, rows: FloatArray) -> FloatArray:
         """Return the worth (N,) of candidates with rows (N, m, P) beside information (P, P)."""
         if self._criterion in INDICES:
             # of M + A^T A, in sigma per metre or radian
-            factor = self._space.factor
+            factor = self.space.factor
             back = times(rows, factor)
             total = factor.T @ information @ factor + np.swapaxes(back, 1, 2) @ back
             singular = np.sqrt(np.maximum(np.linalg.eigvalsh(total), 1e-300))
@@ -167,48 +195,26 @@ class _Worth:
         seen = times(rows, root)
         turned = np.swapaxes(seen, 1, 2)
         whole = np.eye(seen.shape[1]) + seen @ turned
-        if self._wanted is None:
+        if self.wanted is None:
             return np.asarray(np.linalg.slogdet(whole)[1])
-        spread = times(seen, root.T @ self._wanted @ root) @ turned
+        spread = times(seen, root.T @ self.wanted @ root) @ turned
         return np.asarray(np.trace(np.linalg.solve(whole, spread), axis1=1, axis2=2))
 
     def at_most(self, information: FloatArray) -> FloatArray:
         """Return upper bounds (N,): ln det(I + S) <= m ln(1 + tr S / m), m <= 6."""
         if self._criterion in INDICES:  # every candidate is judged in full
-            return np.full(len(self._space.rows), np.inf)
+            return np.full(len(self.space.rows), np.inf)
         root = _root(information)
         inverse = root @ root.T
-        if self._wanted is None:
-            return np.asarray(6.0 * np.log1p(self._space.traces(inverse) / 6.0))
-        return self._space.traces(inverse @ self._wanted @ inverse)  # without (I + A C A^T)^-1
+        if self.wanted is None:
+            return np.asarray(6.0 * np.log1p(self.space.traces(inverse) / 6.0))
+        return self.space.traces(inverse @ self.wanted @ inverse)  # without (I + A C A^T)^-1
 
 
 def _root(information: FloatArray) -> FloatArray:
     """Return L (P, P) with L L^T = M^-1."""
     lower = linalg.cholesky(information, lower=True)
     return np.asarray(linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
-
-
-def efficiency(
-    design: Design, candidates: FloatArray, chosen: Index, task: FloatArray | None
-) -> float:
-    """Return a lower bound of the quality of a choice (K,) relative to the best of that size.
-
-    For the criterion `d`, or `task` with the joint values (M, n) of one; `candidates` are (N, n).
-    As a share of poses: with 0.9 even the best choice would need 90 % of them. Both criteria are
-    convex, and the tangent at the choice (Kiefer and Wolfowitz 1960) bounds the gain of the
-    candidates with the steepest slopes.
-    """
-    space = Candidates(design, candidates)
-    ridge = HALF_THE_DIGITS * np.eye(len(space.known))
-    root = _root(space.known + information_of(space.rows[chosen]) + ridge)
-    slope = root @ root.T
-    if task is not None:
-        slope = slope @ space.of_task(task) @ slope
-    each = space.traces(slope)
-    start = float(np.sum(slope * space.known))
-    steepest = np.sort(each)[-len(chosen) :]
-    return float((start + each[chosen].sum()) / (start + steepest.sum()))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -280,8 +286,8 @@ def plan(
             f'chosen must be {count} numbers from 0 to {last}, not {chosen.tolist()!r:.60}'
         )
     excited = design.determined_by(candidates)
-    if chosen is None:
-        chosen = choose(excited, candidates, count, criterion, task, apart, progress)
+    choice = Choice(excited, candidates, criterion, task, apart, progress)
+    chosen = choice.best(count) if chosen is None else chosen
     found = candidates[chosen]
     visit = visit_order(found, speeds)
     rng = np.random.default_rng(0)
@@ -291,7 +297,7 @@ def plan(
     unknown = len(excited.names) - len(independent(triangular(excited.known), excited.names))
     bound = None
     if criterion in ('d', 'task') and np.isfinite(predictions[-1]):
-        bound = efficiency(excited, candidates, chosen, task if criterion == 'task' else None)
+        bound = choice.efficiency(chosen)
     moves = travel_times(found[visit], speeds)
     return Plan(
         found,
@@ -305,20 +311,14 @@ def plan(
     )
 
 
-def fewest(
-    design: Design,
-    candidates: FloatArray,
-    task: FloatArray,
-    wanted: float,
-    criterion: Criterion = 'd',
-    apart: float = STILL,
-    progress: Notify = quiet,
-) -> Index:
+def fewest(choice: Choice, wanted: float) -> Index:
     """Return the indices (K,) of the fewest poses with the accuracy `wanted`, best first.
 
-    That is the predicted RMS position error [m] at the task poses (T, n).
+    That is the predicted RMS position error [m] at the poses of the task.
     """
-    excited = design.determined_by(candidates)
+    candidates, task = choice.candidates, choice.task
+    assert task is not None
+    excited = choice.design.determined_by(candidates)
     best = predicted(excited.after(candidates), task)
     if best > wanted:
         raise InputError(
@@ -326,13 +326,10 @@ def fewest(
             f'{1e3 * wanted:g} mm are wanted: give more candidates (--draw, --candidates), a '
             'more accurate device (--sigma-position), or a larger --accuracy'
         )
-    chosen = partial(
-        choose, excited, candidates, criterion=criterion, task=task, apart=apart, progress=progress
-    )
     count = len(excited.names)  # poses determine several parameters each
     while True:
         count = min(count, len(candidates))
-        found = chosen(count, exchanged=False)
+        found = choice.quick(count)
         errors = accuracy(excited, candidates[found], task)
         if errors[-1] <= wanted:
             break
@@ -342,7 +339,7 @@ def fewest(
     while reached > 1:  # the first of many are not the best of few
         start = found[:reached] if reached < len(found) else found[: reached - 1]
         for begin in (start, None):  # quick first
-            fewer = chosen(len(start), start=begin)
+            fewer = choice.exchanged(choice.quick(len(start)) if begin is None else begin)
             errors = accuracy(excited, candidates[fewer], task)
             if errors[-1] <= wanted:
                 break

@@ -110,7 +110,8 @@ def _measurement(
     choice = {'criterion': options.criterion, 'apart': options.apart, 'progress': progress}
     needed = chosen = None
     if options.accuracy is not None:
-        fewest = planning.fewest(design, candidates, task, 1e-3 * options.accuracy, **choice)
+        given = planning.Choice(design, candidates, task=task, **choice)
+        fewest = planning.fewest(given, 1e-3 * options.accuracy)
         needed = len(fewest)
         chosen = fewest if options.poses in (None, needed) else None
     count = options.poses or needed or ENOUGH

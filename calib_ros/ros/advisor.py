@@ -31,7 +31,7 @@ from trajectory_msgs.msg import JointTrajectory
 from calib_ros.apply.candidates import draw_candidates
 from calib_ros.apply.compensation import Compensator, in_words
 from calib_ros.apply.design import Design
-from calib_ros.apply.planning import choose
+from calib_ros.apply.planning import Choice
 from calib_ros.apply.program import compensate_program
 from calib_ros.apply.workspace import survey
 from calib_ros.errors import MOST_ENTRIES, CalibrationError, InputError
@@ -143,7 +143,7 @@ class Guide:
             candidates = draw_candidates(design, SOME_POSES, rng)
         candidates = _untaken(candidates, taken)
         if len(candidates):
-            best = candidates[choose(design, candidates, 1)[0]]
+            best = candidates[Choice(design, candidates).best(1)[0]]
             self._next_pose.publish(to_ros.joints(self._session.joint_names, best, self._now()))
 
     def _show(self, calibration: Calibration, world: str) -> None:

@@ -19,7 +19,7 @@ from calib_ros.apply.design import (
     information_of,
     predicted,
 )
-from calib_ros.apply.planning import choose
+from calib_ros.apply.planning import Choice
 from calib_ros.errors import InputError
 from calib_ros.estimation.identifiability import observability
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -90,7 +90,9 @@ def test_the_base_frame_has_no_influence(rng):
     chain = arm()
     moved = replace(chain, base=simulation.random_frame(rng, 2.0))
     q, task = some(chain, 60), some(chain, 50, 2)
-    np.testing.assert_array_equal(choose(design_of(chain), q, 20), choose(design_of(moved), q, 20))
+    np.testing.assert_array_equal(
+        Choice(design_of(chain), q).best(20), Choice(design_of(moved), q).best(20)
+    )
     found, again = (accuracy(design_of(each), q, task) for each in (chain, moved))
     np.testing.assert_allclose(found, again, rtol=1e-6)
 
@@ -132,7 +134,7 @@ def test_priors_make_up_for_poses():
     assert accuracy(helped, few, task)[-1] == pytest.approx(plain_formula, rel=1e-6)
     many = some(chain, 60)
     assert accuracy(helped, many, task)[-1] < accuracy(plain, many, task)[-1]
-    assert len(choose(helped, many, 2)) == 2
+    assert len(Choice(helped, many).best(2)) == 2
 
 
 def test_distances_are_refused():
@@ -149,7 +151,7 @@ def test_indices_are_those_of_the_report(criterion):
     q = some(design.chain, 30)
     space = Candidates(design, q)
     so_far = space.known + information_of(space.rows[:12])
-    worth = planning._Worth(space, criterion).of(so_far, space.rows)
+    worth = planning._Worth(space, criterion, None).of(so_far, space.rows)
     rows = design.rows(np.concatenate([q[:12], q[20:21]])).reshape(-1, len(design.names))
     factor = np.linalg.qr(rows, mode='r')
     assert worth[20] == pytest.approx(observability(factor, 13)[criterion], rel=1e-5)

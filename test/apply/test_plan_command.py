@@ -11,7 +11,7 @@ from designs import arm, design_of, some
 
 from calib_ros.apply import simulation
 from calib_ros.apply.candidates import Visibility, draw_candidates
-from calib_ros.apply.planning import choose
+from calib_ros.apply.planning import Choice
 from calib_ros.cli.screen import Work
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.programs import joints_csv, read_joints
@@ -123,7 +123,7 @@ def test_plan_takes_candidates_task_and_poses_taken_from_files(run, tmp_path):
     found = read_joints(tmp_path / 'plan.csv', chain)
     nearest = np.abs(found[:, None] - q).max(axis=2).min(axis=1)
     assert nearest.max() < 1e-8
-    expected = choose(design_of(chain, oriented=False), q, 12)
+    expected = Choice(design_of(chain, oriented=False), q).best(12)
     assert {tuple(row) for row in found.round(6)} == {tuple(row) for row in q[expected].round(6)}
     _, after, _ = run('plan', *common, '--taken', 'taken.csv', '--criterion', 'task')
 

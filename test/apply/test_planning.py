@@ -14,7 +14,7 @@ from calib_ros import Chain, Problem, identify, load_chain, read_table
 from calib_ros.apply import planning
 from calib_ros.apply.candidates import visit_order
 from calib_ros.apply.design import Candidates, Design, accuracy
-from calib_ros.apply.planning import choose
+from calib_ros.apply.planning import Choice
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.identifiability import observability
 from calib_ros.kinematics.chain import Joint
@@ -37,22 +37,22 @@ def test_the_choice_is_close_to_the_best_of_all_choices(seed):
     size = len(design.names)
 
     best = max(log_det(design, q[each]) for each in choices)
-    chosen = choose(design, q, 4)
+    chosen = Choice(design, q).best(4)
     share = np.exp((log_det(design, q[chosen]) - best) / size)
     assert 0.95 < share < 1.0 + 1e-6
-    assert planning.efficiency(design, q, chosen, None) <= share + 1e-6
+    assert Choice(design, q).efficiency(chosen) <= share + 1e-6
 
     best = min(predicted_square(design, q[each], task) for each in choices)
-    chosen = choose(design, q, 4, 'task', task)
+    chosen = Choice(design, q, 'task', task).best(4)
     share = best / predicted_square(design, q[chosen], task)
     assert 0.8 < share < 1.0 + 1e-6
-    assert planning.efficiency(design, q, chosen, task) <= share + 1e-6
+    assert Choice(design, q, 'task', task).efficiency(chosen) <= share + 1e-6
 
 
 def test_no_choice_is_better_than_all():
     design = design_of(POSITIONER)
     q, task = some(POSITIONER, 9), some(POSITIONER, 30, 7)
-    assert planning.efficiency(design, q, np.arange(9), task) == pytest.approx(1.0)
+    assert Choice(design, q, 'task', task).efficiency(np.arange(9)) == pytest.approx(1.0)
     space = Candidates(design, q)
     square = space.of_task(task)
     wanted = np.trace(space.rows @ square @ np.swapaxes(space.rows, 1, 2), axis1=1, axis2=2)
@@ -68,14 +68,14 @@ def test_choosing_by_an_index_raises_it(criterion):
         factor = np.linalg.qr(design.rows(q[chosen]).reshape(-1, 30), mode='r')
         return observability(factor, len(chosen))[criterion]
 
-    assert index(choose(design, q, 15, criterion)) > 1.01 * index(choose(design, q, 15))
+    assert index(Choice(design, q, criterion).best(15)) > 1.01 * index(Choice(design, q).best(15))
 
 
 def test_effects_are_planned_for_as_well():
     chain = arm()
     design = design_of(chain, effects=('eccentricity', 'gravity'))
     q, task = some(chain, 200), some(chain, 100, 2)
-    chosen = choose(design, q, 40)
+    chosen = Choice(design, q).best(40)
     assert any(name.endswith('.sin_1') for name in design.names)
     assert accuracy(design, q[chosen], task)[-1] < accuracy(design, q[:40], task)[-1]
 
@@ -83,7 +83,7 @@ def test_effects_are_planned_for_as_well():
 def test_each_criterion_is_best_by_its_own_measure():
     design = design_of(arm())
     q, task = some(design.chain, 200), POSTURE + 0.1 * some(design.chain, 50, 2)
-    by_det, by_task = (q[choose(design, q, 20, each, task)] for each in ('d', 'task'))
+    by_det, by_task = (q[Choice(design, q, each, task).best(20)] for each in ('d', 'task'))
     assert log_det(design, by_det) > log_det(design, by_task)
     assert accuracy(design, by_task, task)[-1] < 0.97 * accuracy(design, by_det, task)[-1]
 
@@ -91,7 +91,7 @@ def test_each_criterion_is_best_by_its_own_measure():
 def test_the_first_of_a_choice_tell_the_most():
     design = design_of(arm())
     q, task = some(design.chain, 300), some(design.chain, 100, 2)
-    chosen = q[choose(design, q, 30)]
+    chosen = q[Choice(design, q).best(30)]
     forward, backward = (accuracy(design, each, task) for each in (chosen, chosen[::-1]))
     assert np.isfinite(forward[4])
     assert forward[9] < 0.9 * backward[9]
@@ -102,31 +102,31 @@ def test_the_first_of_a_choice_tell_the_most():
 def test_poses_keep_apart():
     design = design_of(arm())
     q = POSTURE + np.random.default_rng(1).uniform(-0.5, 0.5, (200, 6))
-    chosen = choose(design, q, 20, apart=0.4)
+    chosen = Choice(design, q, apart=0.4).best(20)
     assert pdist(q[chosen], 'chebyshev').min() > 0.4
-    assert pdist(q[choose(design, q, 20)], 'chebyshev').min() < 0.4
+    assert pdist(q[Choice(design, q).best(20)], 'chebyshev').min() < 0.4
     with pytest.raises(InputError, match='give more candidates'):
-        choose(design, q, 100, apart=0.9)
+        Choice(design, q, apart=0.9).best(100)
 
 
 def test_no_configuration_is_chosen_twice():
     design = design_of(arm())
     q = np.repeat(some(design.chain, 20), 5, axis=0)
-    chosen = choose(design, q, 20)
+    chosen = Choice(design, q).best(20)
     assert len(np.unique(q[chosen], axis=0)) == 20
     with pytest.raises(InputError, match='only 20 of 100 candidates'):
-        choose(design, q, 21)
+        Choice(design, q).best(21)
 
 
 def test_wrong_arguments_are_refused():
     design = design_of(arm())
     q = some(design.chain, 20)
     with pytest.raises(ConfigError, match='needs the poses of a task'):
-        choose(design, q, 5, 'task')
+        Choice(design, q, 'task').best(5)
     with pytest.raises(ConfigError, match='count must be at least 1, not 0'):
-        choose(design, q, 0)
+        Choice(design, q).best(0)
     with pytest.raises(ConfigError, match='unknown criterion "e"'):
-        choose(design, q, 5, 'e')
+        Choice(design, q, 'e').best(5)
     for in_degrees in (np.degrees(q), q), (q, np.degrees(q)):
         with pytest.raises(InputError, match=r'\[0, .*beyond the limits of .*not degrees'):
             planning.plan(design, *in_degrees, 5)
@@ -143,7 +143,7 @@ def test_half_of_the_measured_poses_predict_as_well_as_all():
     """Chosen without what was measured there; and the noise found is what is left on others."""
     problem = measured_problem('fr3_camera_eyeinhand', 'all')
     fitted = problem.observations
-    chosen = choose(Design.of(problem), fitted.joints, len(fitted) // 2)
+    chosen = Choice(Design.of(problem), fitted.joints).best(len(fitted) // 2)
     half = identify(replace(problem, observations=fitted.select(chosen)))
     whole = identify(problem).validation.figures[1].rms_mm
     assert half.validation.figures[1].rms_mm < 1.1 * whole
@@ -184,15 +184,15 @@ def test_so_many_poses_are_needed_and_no_fewer(criterion, wanted):
     """Also of more poses than the parameters that the search begins with."""
     chain = arm()
     design, q, task = design_of(chain), some(chain, 200), some(chain, 100, 2)
-    found = planning.fewest(design, q, task, wanted, criterion)
+    found = planning.fewest(Choice(design, q, criterion, task), wanted)
 
     def best(count):
-        return accuracy(design, q[choose(design, q, count, criterion, task)], task)[-1]
+        return accuracy(design, q[Choice(design, q, criterion, task).best(count)], task)[-1]
 
     assert (len(found) > len(design.names)) == (wanted < 1e-4)
     assert accuracy(design, q[found], task)[-1] <= wanted < best(len(found) - 1)
     with pytest.raises(InputError, match='all 200 candidates together'):
-        planning.fewest(design, q, task, 1e-6)
+        planning.fewest(Choice(design, q, 'd', task), 1e-6)
 
 
 def travel(q, order, speeds):
