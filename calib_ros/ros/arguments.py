@@ -58,7 +58,7 @@ calibration_filename* ''  file to publish at startup and on ~/load, in the same 
 the newest, by autoload or ~/load
 socket* ''  LOCATION/SOCKET, such as A/1, that holds the ball when ~/capture is called; default: \
 none, a measurement is taken
-largest_loss* {EXCEPTION}  largest share of joint states or measurements dropped because of \
+largest_loss* {EXCEPTION} 1  largest share of joint states or measurements dropped because of \
 stamps or full buffers
 marker_scale* 200.0  enlargement of the residual vectors
 candidates ''  table of poses (q1 ... qn) that ~/next_pose chooses from; default: any pose
@@ -68,15 +68,15 @@ flange_frame ''  flange frame in which the target is published on /tf_static; de
 published
 target_frame 'target'  frame name of the target on /tf_static
 """
-"""Name, `*` if it can change, default, description; numbers are not negative, shares <= 1."""
+"""Name, `*` if it can change, default, largest value if any, description; none is negative."""
 
 
 def _written(line: str) -> NodeParameter:
     head, text = line.split('  ', 1)
-    name, default = head.split(' ')
+    name, default, *most = head.split(' ')
     value = literal_eval(default)
     lower = 0.0 if isinstance(value, float) else None
-    upper = 1.0 if 'share of' in text else math.inf
+    upper = max(map(float, most), default=math.inf)
     return NodeParameter(name.rstrip('*'), value, text, not name.endswith('*'), lower, upper)
 
 
