@@ -100,5 +100,6 @@ def test_frames_that_stand_still_and_single_shots_may_be_silent(monkeypatch, lat
     hearing = TopicState(latched=latched)
     for now in (-100.0, -100.0 + 5.0 * every):
         hearing.count += 1
-        hearing.look(now, 1.0)
+        hearing.look(now, 0.5)
+    assert hearing.rate == 2.0
     assert hearing.silent is (every < 1.0 and not latched)
