@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables put together wrongly: rows lost or repeated, columns dead or in any order.
+"""Tables put together wrongly: rows lost, repeated or sorted, columns dead or in any order.
 
 A row missing in one of two tables put side by side mismatches later rows: one shift s of the joint
 values fits the measurements before a row k, another from there on, and one of them is zero. Base
@@ -19,7 +19,7 @@ from calib_ros.decision.suspects import reordered, rows_away
 from calib_ros.decision.trials import in_frames, largest_of, sample_errors
 from calib_ros.decision.undoing import Sets, Suspect
 from calib_ros.estimation.configurations import count_distinct
-from calib_ros.estimation.levels import LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
+from calib_ros.estimation.levels import CONFIDENT, LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import flange
@@ -38,8 +38,8 @@ EXPLAINED_ROWS = 1.0 - EXCEPTION  # share of the rows that a loss must explain
 
 def row_loss(
     problem: Problem, nominal: Chain, seen: Observations, largest: float
-) -> tuple[str, float] | None:
-    """Return the loss that explains nearly all pairs (N), if one does, in words.
+) -> tuple[Suspect, float] | None:
+    """Return the loss that explains nearly all pairs (N), if one does.
 
     A faulty arm has errors of up to `largest` [m]. Then follows the typical error [m] once
     corrected.
@@ -47,7 +47,8 @@ def row_loss(
     count = len(seen)
     if not FEWEST_ROWS <= count <= MOST_SEARCHED:
         return None
-    best: tuple[str, float] | None = None
+    best: tuple[Suspect, float] | None = None
+    remedy = 'is a row missing or duplicated in one of two tables? Correct it'
     good, rows = EXPLAINED_ROWS * count, np.arange(count)
     inside = {s: (rows + s >= 0) & (rows + s < count) for s in SLIPS}
     paired = {
@@ -71,8 +72,41 @@ def row_loss(
                 name = rows_in_words([row], seen.stamps_ns)
                 where = f'from {name} on' if after else f'before {name}'
                 error = float(np.median(pieced[np.isfinite(pieced)]))
-                best = f'{where} {rows_away(after or before)}', error
+                best = Suspect(f'{where} {rows_away(after or before)}', remedy), error
     return best
+
+
+def other_order(
+    problem: Problem, nominal: Chain, seen: Observations, largest: float
+) -> tuple[Suspect, float] | None:
+    """Return in which order the rows of joint values stand, as `row_loss`.
+
+    That is the reverse one, or that of numbers as text. If no such order is worse than theirs, a
+    column that goes one way was perhaps sorted alone.
+    """
+    rows = np.arange(len(seen))
+    if not FEWEST_ROWS <= len(rows) <= MOST_SEARCHED:
+        return None
+    what = 'the joint values stand in the reverse order of the measurements'
+    orders = [('', rows), (what, rows[::-1])]
+    for first in (1, 0):
+        text = np.array(sorted(rows.tolist(), key=lambda k: str(k + first)))
+        by = f'are sorted as text ({", ".join(map(str, (text[:3] + first).tolist()))} ...)'
+        orders += [(f'the measurements {by}', text), (f'the joint values {by}', np.argsort(text))]
+    sets = (replace(seen, joints=seen.joints[order]) for _, order in orders)
+    errors = [in_frames(problem, nominal, (each,)).error for each in sets]
+    best = int(np.argmin(errors))
+    if errors[best] <= largest:
+        remedy = 'sort both alike, or name the poses in both tables (--joints)'
+        return (Suspect(orders[best][0], remedy), errors[best]) if best else None
+    steps = np.diff(np.column_stack([seen.joints, seen.given]), axis=0)
+    one_way = steps.any(axis=0) & ((steps >= 0).all(axis=0) | (steps <= 0).all(axis=0))
+    if errors[0] < CONFIDENT * errors[best] or not one_way.any():
+        return None
+    name = (*nominal.joint_names, *'xyz')[one_way.argmax()]
+    what = 'the joint values fit the measurements no better than in any other order of the rows'
+    remedy = 'was it sorted without the others? Export them again, and sort whole rows'
+    return Suspect(f'{what}, and {name} goes one way from row to row', remedy), np.nan
 
 
 def in_any_order(chain: Chain, seen: Observations, of_images: bool) -> Iterator[Suspect]:

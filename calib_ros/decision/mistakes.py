@@ -12,14 +12,14 @@ rotation of the base, that of the last joint one of the tool, so neither can be 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from calib_ros.decision.lost_rows import constant_axes, in_any_order, repeating, row_loss
+from calib_ros.decision import lost_rows
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import FIRST, ORIENTATIONS, hidden, suspects
@@ -156,9 +156,9 @@ def diagnose(problem: Problem, far: bool = False) -> Diagnosis | None:
     given = in_frames(problem, chain, sets)
     if far and given.error <= largest_of(problem):
         return None
-    missing = None if _has_images(problem) else constant_axes(chain, given.sets)
+    missing = None if _has_images(problem) else lost_rows.constant_axes(chain, given.sets)
     found = missing and Diagnosis((missing,), given.error, np.nan)  # no change restores it
-    found = found or _of_a_lost_row(problem, chain, sets, given)
+    found = found or _of_two_tables(problem, chain, sets, given, lost_rows.row_loss)
     if not found:
         tried = _best_trials(problem, chain, sets, given)
         found = (
@@ -168,6 +168,7 @@ def diagnose(problem: Problem, far: bool = False) -> Diagnosis | None:
             or _in_some_rows(problem, chain, sets, given)
             or _beam_search(problem, chain, given)
             or _named(problem, given, tried, inexact=True)
+            or _of_two_tables(problem, chain, sets, given, lost_rows.other_order)
         )
     return found and _for_messages(problem, replace(found, where=where + found.where))
 
@@ -227,7 +228,7 @@ def _best_trials(
     """
     rough, of_images = [], _has_images(problem)
     likely = suspects(chain, given.sets, of_images)
-    for each in (*likely, *in_any_order(chain, given.sets[0], of_images)):
+    for each in (*likely, *lost_rows.in_any_order(chain, given.sets[0], of_images)):
         if of_rows and (each.chain is not None or not each.changes):
             continue
         few = given.sets
@@ -264,22 +265,27 @@ def _named(
     return Diagnosis(tuple(unlike.values())[:SEVERAL], given.error, best.error)
 
 
-def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Diagnosis | None:
-    """Return a row missing in one of two tables side by side, if that explains all."""
+def _of_two_tables(
+    problem: Problem,
+    chain: Chain,
+    sets: Sets,
+    given: Trial,
+    search: Callable[[Problem, Chain, Observations, float], tuple[Suspect, float] | None],
+) -> Diagnosis | None:
+    """Return what is wrong with the rows of two tables side by side, if that explains all."""
     if problem.of_messages or len(sets) > 1 or sets[0].socket or sets[0].pixels is not None:
         return None
-    found = row_loss(problem, chain, _shift_joints(problem, sets[0], 0), largest_of(problem))
-    if found is None:
+    whole = _shift_joints(problem, sets[0], 0)
+    if (found := search(problem, chain, whole, largest_of(problem))) is None:
         return None
-    what, error = found
-    remedy = 'is a row missing or duplicated in one of two tables? Correct it'
+    suspect, error = found
     # the typical error tells nothing if most rows are right
     corrected = error if error < NEARER * given.error else np.nan
-    return Diagnosis((Suspect(what, remedy),), given.error, corrected)
+    return Diagnosis((suspect,), given.error, corrected)
 
 
 def _of_repeats(problem: Problem, chain: Chain, seen: Observations) -> Diagnosis | None:
-    odd = repeating(chain, seen, largest_of(problem), problem.of_messages)
+    odd = lost_rows.repeating(chain, seen, largest_of(problem), problem.of_messages)
     return None if odd is None else Diagnosis((odd,), np.nan, np.nan)
 
 

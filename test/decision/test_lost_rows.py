@@ -70,6 +70,41 @@ def test_rows_lost_before_the_first_and_again_later_are_not_told_as_one():
 
 
 @pytest.mark.parametrize(
+    ('order', 'said', 'known'),
+    [
+        (np.arange(40)[::-1], 'stand in the reverse order of the measurements', True),
+        (sorted(range(40), key=str), 'joint values are sorted as text (0, 1, 10 ...)', True),
+        ([int(k) - 1 for k in sorted(map(str, range(1, 41)))], 'sorted as text (1, 10, 1', True),
+        (np.argsort(sorted(range(40), key=str)), 'measurements are sorted as text (0, 1, ', True),
+        ('elbow_joint', 'any other order of the rows, and elbow_joint goes one way', False),
+        ('x', 'any other order of the rows, and x goes one way from row to row', False),
+    ],
+)
+@pytest.mark.parametrize('oriented', [True, False])
+def test_rows_of_joint_values_in_another_order_are_named(order, said, known, oriented):
+    *_, seen = measured_arm(1, 40, oriented=oriented)
+    if isinstance(order, str) and order == 'x':
+        other = seen.select(np.argsort(seen.positions[:, 0]))
+        mixed = replace(other, joints=seen.joints, stamps_ns=seen.stamps_ns)
+    else:
+        own = np.argsort(seen.joints[:, 2]) if isinstance(order, str) else order
+        mixed = replace(seen, joints=seen.joints[own])
+    found = diagnose(Problem(UR10E, mixed))
+    assert said in str(found)
+    assert (found.corrected < 5e-3) == known
+
+
+def test_rows_that_fit_are_in_no_other_order_nor_are_those_of_messages():
+    *_, seen = measured_arm(1, 40, oriented=False)
+    assert lost_rows.other_order(Problem(UR10E, seen), UR10E, seen, 5e-3) is None
+    mixed = replace(seen, joints=seen.joints[np.random.default_rng(1).permutation(40)])
+    assert diagnose(Problem(UR10E, mixed)) is None
+    assert (
+        diagnose(Problem(UR10E, replace(seen, joints=seen.joints[::-1]), of_messages=True)) is None
+    )
+
+
+@pytest.mark.parametrize(
     ('before', 'after', 'row'),
     [('11100', '00111', 2), ('11110', '00011', 3), ('00000', '11111', 0), ('11111', '00000', 5)],
 )

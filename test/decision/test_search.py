@@ -123,7 +123,7 @@ def searched(monkeypatch):
         ]
         hidden = [tuple(one for one in suspects if one.what in pair) for pair in pairs]
         monkeypatch.setattr(mistakes, 'suspects', lambda *_: suspects)
-        monkeypatch.setattr(mistakes, 'in_any_order', lambda *_: ())
+        monkeypatch.setattr(mistakes.lost_rows, 'in_any_order', lambda *_: ())
         monkeypatch.setattr(mistakes, 'hidden', lambda *_: hidden)
         monkeypatch.setattr(mistakes, 'trial_of', trial_of)
         monkeypatch.setattr(mistakes, 'refine_trial', lambda problem, trial: trial)
