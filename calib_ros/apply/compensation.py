@@ -198,8 +198,9 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
     beyond = (command < follower.lower - EXACT) | (command > follower.upper + EXACT)
     too_large = np.abs(correction) > compensator.largest
     remaining = (apart > most) | (result.orientation > tolerated)
-    # a redundant arm may oscillate among solutions, all of them correct
-    astray = ~result.converged & ((result.position > EXACT) | (result.orientation > EXACT))
+    # a redundant arm may oscillate among solutions, all correct, one in part among orientations
+    away = (result.reachable > EXACT) | (follower.complete & (result.orientation > EXACT))
+    astray = ~result.converged & away
     wrong = beyond.any(axis=1) | too_large.any(axis=1) | remaining | astray
     largest = f'{compensator.largest_turn:g} rad or {compensator.largest_shift:g} m'
     found = []
@@ -227,7 +228,7 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
         elif result.converged[k] and not follower.complete:
             reason = (
                 f'this arm cannot reach every pose: {left} remain, more than {1e3 * most:g} mm '
-                f'or {1e3 * tolerated:g} mrad'
+                f'or {1e3 * tolerated:g} mrad (--largest-orientation-error)'
             )
         else:
             how = '' if result.converged[k] else ', without convergence'
