@@ -47,6 +47,8 @@ SIMULATION = f"""\
   --seed N=0  {SEED}
   --storage {'|'.join(STORAGES)}=mcap  storage format of the bag"""
 EYE = '  --eye-in-hand  poses or positions are of a fixed target, seen from the flange'
+LOSS = f"""  --largest-loss SHARE={EXCEPTION}  share of a bag's messages that may be lost or \
+unused for the result to be accepted; 1: any"""
 MOVED = """\
   --new-base  the measuring device, or what a camera on the flange sees, was moved
   --new-tool  the target was replaced or remounted"""
@@ -144,8 +146,7 @@ or .db3
   --chain! ROBOT  {CHAIN}
   --session NAME  only rows with this name in the column session; several joined by commas
 {EYE}
-  --largest-loss SHARE={EXCEPTION}  share of a bag's messages that may be lost or unused for \
-the result to be accepted; 1: any
+{LOSS}
   --sigma-touch M  standard deviation of heights over touched planes; default: 1e-4
 what to write
   --out FOLDER  calibration, result and report
@@ -209,6 +210,7 @@ what to judge
 intends
   --session NAME  only rows with this name in the column session
 {EYE}
+{LOSS}
 {MOVED}
 how to judge
   --tolerance MM  wanted RMS position error; without it: does the calibration still hold?

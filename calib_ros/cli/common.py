@@ -142,6 +142,12 @@ def at_least(options: argparse.Namespace, **lowest: float) -> None:
             raise InputError(f'--{name} must be at least {least}, not {value}')
 
 
+def check_loss(options: argparse.Namespace) -> None:
+    """Refuse a largest loss that is no share."""
+    if not 0.0 <= options.largest_loss <= 1.0:
+        raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
+
+
 def refuse_existing(options: argparse.Namespace, *paths: Path) -> None:
     """Refuse to overwrite files, or write to a missing folder, before any work."""
     for path in paths:

@@ -49,8 +49,7 @@ NOT_OF_UPDATES = ('history', 'tolerance', 'model', 'fixed', 'priors', 'folds')
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     if options.tolerance is not None and not 0.0 < options.tolerance < math.inf:
         raise InputError(f'--tolerance must be positive, not {options.tolerance}')
-    if not 0.0 <= options.largest_loss <= 1.0:
-        raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
+    common.check_loss(options)
     if options.previous is not None:
         common.refuse(options, NOT_OF_UPDATES, 'does not apply to --previous')
         return _recalibrated(options, screen)

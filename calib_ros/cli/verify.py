@@ -12,6 +12,7 @@ from calib_ros.apply.verification import Verification, verify
 from calib_ros.cli import common, inputs
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import GOOD_OR_BAD, Screen
+from calib_ros.decision.reasons import Rule
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.observations import Observations
@@ -35,6 +36,7 @@ VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     screen.quiet = screen.quiet or options.json
+    common.check_loss(options)
     with common.output_files(options, VERIFICATION_FILES) as contents:
         status, file = _verified(options, screen, contents)
     if options.out is not None:
@@ -138,6 +140,11 @@ def _sets(
         screen.say(f'{read}; {session.account()}')
         if not session.usable:
             raise InputError(f'{options.measured} gives no poses: {session.account()}')
+        if lost := read.refusals(session.account(), options.largest_loss):
+            told = '; '.join((*read.warnings, *lost))
+            if lost[0].rule is not Rule.DROPPED:
+                told += '. First copy the bag again from the computer that made it'
+            raise InputError(told)
         found = dataset_of(session.usable, settings.sigmas)
         found = replace(found, warnings=read.warnings)
     names = arm.frames_of(found.owners)

@@ -132,6 +132,23 @@ def test_a_table_of_a_camera_on_the_flange_is_read_as_by_identify(cell, folder, 
     assert run(*VERIFY, 'seen', '--tolerance', 1, '--eye-in-hand')[0] == 0
 
 
+def test_a_bag_of_which_much_is_lost_has_no_verdict_unless_asked_for(cell, folder, run):
+    """The missing part could hold the poses that are off."""
+    q = UR.random_joints(40, np.random.default_rng(3))
+    write_csv(folder / 'measured.csv', rows_of(measured(cell[0], q), 0))
+    assert run('csv2bag', 'measured.csv', 'bag', '--chain', 'ur10e')[0] == 0
+    (file,) = (folder / 'bag').glob('*.mcap')
+    file.write_bytes(file.read_bytes()[: int(0.5 * file.stat().st_size)])
+    judge = ('verify', 'bag', *VERIFY[2:], 'result', '--tolerance', 1)
+    status, out, told = run(*judge)
+    assert (status, 'PASS' in out) == (1, False)
+    assert 'First copy the bag again from the computer that made it' in told
+    allowed = told.split('(--largest-loss) ')[1].split('. ')[0]
+    status, out, told = run(*judge, '--largest-loss', allowed)
+    assert (status, 'PASS' in out, 'messages are lost' in told) == (0, True, True)
+    assert '--largest-loss must be from 0 to 1' in run(*judge, '--largest-loss', 2)[2]
+
+
 def test_plan_writes_test_poses_that_are_seen(run, tmp_path):
     box = ('--box', 0.2, -0.5, 0.2, 1, 0.5, 1, '--tracker', 3, 0, 1)
     assert run('plan', '--chain', 'ur10e', '--iso9283', '--out', 'tests.csv', *box)[0] == 0
