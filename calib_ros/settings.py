@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -44,21 +45,32 @@ def effects_of(model: str) -> tuple[str, ...]:
     return () if model in ('geometric', 'auto') else tuple(model.split('+'))
 
 
+def refuse_larger(name: str, value: float, setting: Mapping[str, Any]) -> None:
+    """Refuse a value above the upper limit of a setting: it is perhaps in another unit."""
+    if value > setting['upper']:
+        most, what = f'{setting["upper"]:.4g}', setting['text']
+        raise ConfigError(f'{name} must be at most {most}, not {value:g} ({what})')
+
+
 @dataclass(frozen=True, kw_only=True)
 class Limits:
     """Limits of a correction of joint commands."""
 
-    largest_turn: float = _setting(0.1, 'largest correction of a revolute joint [rad]')
-    largest_shift: float = _setting(0.05, 'largest correction of a prismatic joint [m]')
+    largest_turn: float = _setting(
+        0.1, 'largest correction of a revolute joint [rad]', upper=math.pi
+    )
+    largest_shift: float = _setting(0.05, 'largest correction of a prismatic joint [m]', upper=1.0)
     largest_position_error: float | None = _setting(
         None,
         'position error that may remain [m]; default: 1e-6 where the joints can move the target, '
         'any in other directions',
+        upper=1.0,
     )
     largest_orientation_error: float | None = _setting(
         None,
         f'orientation error that may remain [rad]; default: 1e-6, or {TURN_IN_PART} for arms '
         'that cannot reach every orientation',
+        upper=math.pi,
     )
     orientation_weight: float | None = _setting(
         None,
@@ -75,12 +87,13 @@ class Settings:
     """All settings besides the chain; the node and the command line use the same names."""
 
     sigma_position: float = _setting(
-        1e-4, 'standard deviation of positions that come without a covariance [m]', 1e-9
+        1e-4, 'standard deviation of positions that come without a covariance [m]', 1e-9, 1.0
     )
     sigma_orientation: float = _setting(
         1e-4 / LEVER,
         'standard deviation of orientations that come without a covariance [rad]',
         1e-9,
+        math.pi,
     )
     sigma_pixel: float = _setting(
         0.3, 'standard deviation of a corner coordinate in an image [px]', 1e-6
@@ -92,7 +105,7 @@ class Settings:
         0.0,
     )
     socket_distance: float = _setting(
-        0.05, 'distance between the two sockets of a location [m]', 1e-6
+        0.05, 'distance between the two sockets of a location [m]', 1e-6, 1.0
     )
     max_gap: float = _setting(
         0.1, 'longest time between the two joint states that bracket a measurement [s]', 1e-6, 60.0
@@ -133,13 +146,13 @@ class Settings:
     frame_id: str = _setting('', 'required frame of the measurements; default: any')
     folds: int = _setting(5, 'number of cross-validation folds', 2)
     largest_length: float = _setting(
-        0.05, 'a larger change of a length is not accepted: wrong robot? [m]', 1e-9
+        0.05, 'a larger change of a length is not accepted: wrong robot? [m]', 1e-9, 1.0
     )
     largest_angle: float = _setting(
-        0.1, 'a larger change of an angle is not accepted: wrong robot? [rad]', 1e-9
+        0.1, 'a larger change of an angle is not accepted: wrong robot? [rad]', 1e-9, math.pi
     )
     largest_error: float = _setting(
-        0.01, 'a larger RMS error on held-out poses is not accepted: wrong robot? [m]', 1e-9
+        0.01, 'a larger RMS error on held-out poses is not accepted: wrong robot? [m]', 1e-9, 1.0
     )
     loss: str = _setting('redescending', 'treatment of gross errors: redescending, huber or none')
     priors: tuple[str, ...] = _setting(
@@ -181,8 +194,7 @@ class Settings:
         if self.mode not in MODES:
             raise UnknownNameError('mode', self.mode, MODES)
         for item in fields(self):
-            value = getattr(self, item.name)
-            lower, upper = item.metadata['lower'], item.metadata['upper']
+            value, lower = getattr(self, item.name), item.metadata['lower']
             if isinstance(item.default, tuple):  # longer lists would take very long
                 longest = max(map(len, value), default=0)
                 for count, what in ((len(value), 'entries'), (longest, 'characters in an entry')):
@@ -194,8 +206,8 @@ class Settings:
                 raise ConfigError(f'{item.name} must be a finite number, not {value}')
             if lower is not None and value < lower:
                 raise ConfigError(f'{item.name} must be at least {lower}, not {value}')
-            if lower is not None and value > upper:
-                raise ConfigError(f'{item.name} must be at most {upper:g}, not {value:g}')
+            if lower is not None:
+                refuse_larger(item.name, value, item.metadata)
         for name in ('shortest_stop', 'settle'):
             value = getattr(self, name)
             if value >= self.longest_stop:

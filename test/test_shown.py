@@ -121,6 +121,7 @@ def test_results_are_read_only():
                 *(('sigma_position', 0.0), ('sigma_position', -1e-4), ('sigma_position', np.nan)),
                 *(('sigma_orientation', np.inf), ('max_gap', -0.1), ('max_gap', np.inf)),
                 *(('joint_buffer', 1), ('pose_buffer', 0), ('folds', 1), ('largest_angle', 0.0)),
+                *(('sigma_position', 50), ('largest_error', 10), ('largest_angle', 5)),
             )
         ),
         (partial(calib_ros.Problem, CHAIN, SEEN, priors={'*.a': 0}), r"priors\['\*.a'\] must"),

@@ -29,7 +29,7 @@ from calib_ros.kinematics.follower import Follower, Solution
 from calib_ros.kinematics.inverse import a_turn_away
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify, quiet
-from calib_ros.settings import EXACT, LEVER, TURN_IN_PART, Limits
+from calib_ros.settings import EXACT, LEVER, TURN_IN_PART, Limits, refuse_larger
 from calib_ros.shown import Shown
 
 BESIDE = LEVER / 3.0
@@ -56,10 +56,11 @@ class Compensator(Shown, Limits):
         refuse_other_joints('the calibrated chain', self.calibrated, *known)
         if not (np.abs(self.tool) <= 5.0).all():
             raise ConfigError(f'tool must be within 5 m, not {self.tool}: 150 mm is 0.15')
-        for name in (item.name for item in fields(Limits)):
-            value = getattr(self, name)
+        for item in fields(Limits):
+            value = getattr(self, item.name)
             if value is not None and not 0.0 < value < np.inf:
-                raise ConfigError(f'{name} must be a positive number, not {value}')
+                raise ConfigError(f'{item.name} must be a positive number, not {value}')
+            refuse_larger(item.name, value or 0.0, item.metadata)
 
     @cached_property
     def follower(self) -> Follower:

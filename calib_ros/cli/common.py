@@ -148,6 +148,12 @@ def check_loss(options: argparse.Namespace) -> None:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
 
 
+def check_tolerance(options: argparse.Namespace) -> None:
+    """Refuse a tolerance in another unit than mm."""
+    if options.tolerance is not None and not 0.0 < options.tolerance <= 100.0:
+        raise InputError(f'--tolerance must be between 0 and 100 mm, not {options.tolerance:g} mm')
+
+
 def refuse_existing(options: argparse.Namespace, *paths: Path) -> None:
     """Refuse to overwrite files, or write to a missing folder, before any work."""
     for path in paths:

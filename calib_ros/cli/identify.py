@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -47,8 +46,7 @@ NOT_OF_UPDATES = ('history', 'tolerance', 'model', 'fixed', 'priors', 'folds')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    if options.tolerance is not None and not 0.0 < options.tolerance < math.inf:
-        raise InputError(f'--tolerance must be positive, not {options.tolerance}')
+    common.check_tolerance(options)
     common.check_loss(options)
     if options.previous is not None:
         common.refuse(options, NOT_OF_UPDATES, 'does not apply to --previous')

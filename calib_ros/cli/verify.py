@@ -37,6 +37,7 @@ VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     screen.quiet = screen.quiet or options.json
     common.check_loss(options)
+    common.check_tolerance(options)
     with common.output_files(options, VERIFICATION_FILES) as contents:
         status, file = _verified(options, screen, contents)
     if options.out is not None:
@@ -56,8 +57,6 @@ def _verified(
     sets, warnings, by_line = _sets(options, nominal, arm, screen)
     commanded = read_joints(options.commanded, nominal) if options.commanded else None
     tolerance = None if options.tolerance is None else 1e-3 * options.tolerance
-    if tolerance is not None and not 0.0 < tolerance <= 0.1:
-        raise InputError(f'--tolerance must be between 0 and 100 mm, not {options.tolerance:g} mm')
     confidence, moved = options.confidence, (options.new_base, options.new_tool)
     with screen.work('judging') as work:
         found = verify(arm, sets, tolerance, confidence, moved[0], commanded, moved[1], work)

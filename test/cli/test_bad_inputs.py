@@ -36,8 +36,8 @@ def bad_inputs():
     yield 'another number of joints', (*chain_of, 'franka_panda'), 'q7'
     yield 'a frame is no parameter', (*good, '--fixed', 'base.x'), 'fixed: true'
     yield 'nothing left', (*good, '--fixed', '*'), 'every parameter is fixed: nothing is left to'
-    for wrong in ('0', '-1', '-1e-3', 'nan', 'inf'):
-        yield f'tolerance {wrong}', (*good, '--tolerance', wrong), '--tolerance must be positive'
+    for wrong in ('0', '-1', '-1e-3', 'nan', 'inf', '300'):
+        yield f'tolerance {wrong}', (*good, '--tolerance', wrong), '--tolerance must be between 0'
     yield ('useless option', (*good, '--sources', '/pose'), '--sources does not apply to a table')
     yield 'new base', (*good, '--new-base'), '--new-base needs --previous'
     yield 'growth', (*good, '--growth', '30'), '--growth needs --previous'
