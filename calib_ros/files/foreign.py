@@ -204,6 +204,7 @@ class _Table:
     def _named(self, own: Mapping[str, str]) -> dict[str, Expression]:
         """Return more of our columns, that the header calls by our names or the chain's."""
         kept, guessed = dict[str, Expression](), dict[str, str]()
+        asked = {name for each in self._columns.values() for name in each.names}
         lower = [name.lower() for name in self._sheet.header]
         for name, ours in own.items():
             found = places(self._sheet.header, name) or places(lower, name.lower())
@@ -215,9 +216,11 @@ class _Table:
             bare, unit = name_and_unit(self._sheet.header[column])
             rate = JOINT.fullmatch(ours) and ours[0] in 'sva'
             other = rate or ours in (*WORDS, *SIGMAS, 'time', 'delay')
-            if (rate and bare != name) or (other and unit not in (*UNIT_SIGNS, *SECONDS)):
-                continue  # the axes of KUKA are A1, A2, ...: no accelerations
             number = f'#{column + 1}'
+            if (rate and (bare != name or number in asked)) or (
+                other and unit not in (*UNIT_SIGNS, *SECONDS)
+            ):
+                continue  # the axes of KUKA are A1, a1, ...: no accelerations
             if ours == 'time' and math.isinf(self._first(number)):  # a date
                 continue
             kept[ours] = Expression.parse(number)

@@ -58,10 +58,15 @@ class Units:
             if any(map(self._header_unit, main))
             else {*map(self._header_unit, turned)} - {''}
         )
+        given_of_joints = own or ('' if layout.joint_angle else angle)
+        usual = layout.joint_angle or usual
+        if len(said) == 1 and main and not (given_of_joints or usual):
+            usual = said.pop()
+            self.notes.append(f'joint values are taken in {usual}, as its other angles are')
         found |= turned | self._units_of(
             'joint-angle',
-            own or ('' if layout.joint_angle else angle),
-            layout.joint_angle or usual or (said.pop() if len(said) == 1 else ''),
+            given_of_joints,
+            usual,
             main,
             [name for name in turns if name not in main],
         )

@@ -281,6 +281,23 @@ def test_rows_in_which_nothing_was_measured_are_left_out_and_said(read):
     assert 'line 5: skipped' in ' '.join(table.warnings)
 
 
+@pytest.mark.parametrize('letter', 'asv')
+def test_columns_read_as_joint_values_are_no_rates_nor_signs(read, letter):
+    """The axes of KUKA are a1, a2 ... to some; they were taken for accelerations as well."""
+    text = text_of(JOINTS, PLACES, names=[f'{letter}1', f'{letter}2', 'x', 'y', 'z'])
+    table = read(text, columns={'q1': f'{letter}1', 'q2': f'{letter}2'})
+    assert_same(table, None)
+    (found,) = table.fitted
+    assert (found.velocity, found.acceleration, found.approach) == (None, None, None)
+
+
+def test_joint_values_in_the_unit_of_other_angles_are_told(read):
+    text = text_of(JOINTS, PLACES, 0 * PLACES, names=[*NAMES, 'rx [deg]', 'ry', 'rz'])
+    table = read(text, euler='XYZ')
+    np.testing.assert_allclose(table.fitted[0].joints, np.radians(JOINTS))
+    assert any('joint values are taken in deg, as its other' in each for each in table.warnings)
+
+
 def test_angles_of_unknown_form_are_left_out_with_units_given_too(read):
     """The units that a message advises led to a refusal."""
     for more in ('', ',srx,sry,srz'):
@@ -309,6 +326,7 @@ def test_joint_values_that_stand_a_row_below(read):
         ('a,b,x,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'c', 'q2': 'b'}}, 'no column c'),
         ('a,b,a,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'a'}}, 'comes 2 times: name it by its'),
         ('q1,q2,x,y,z,split,split\n1,2,3,4,5,,test\n', {}, 'split" comes 2 times'),
+        (PLAIN + 'q1,q2,y,x,z\n1,2,3,4,5\n', {}, 'line 5: .*: split the file above that line'),
         (PLAIN, {'columns': {'x': '#9'}}, 'has no column #9 for x'),
         (DEGREES, {'columns': dict(zip(TURNS, TURNS, strict=True))}, 'in degrees, .*--angle deg'),
         (DEGREES.replace('90', '1'), {'inverse': True}, 'say which, --euler'),
