@@ -82,6 +82,8 @@ class Columns:
         if commas := DECIMAL_COMMA.fullmatch(bare) is not None:
             told = f'; if these are thousands, {remedy}' * bool(THOUSANDS.fullmatch(bare))
             remedy = f'write a point or, of measurements, give --decimal comma{told}'
+        if bare.split(' [')[0] == called.split(' [')[0]:  # the header again, but not the same
+            remedy = 'other columns or units begin there: split the file above that line'
         cut = re.fullmatch(r'[^a-z]*[0-9.] ?(\D+)', bare, re.I)
         if cut and cut[1].lower() in UNIT_SIGNS:
             remedy = f'write its unit into the header, {called.split(" [")[0]} [{cut[1]}]'
@@ -302,7 +304,8 @@ def csv_blocks(
                 line = rows[-2][0] if len(rows) > 1 else before
                 raise csv.Error('unexpected end of data')
             if (most := max((len(row) for _, row in rows), default=0)) > MOST_ENTRIES:
-                raise InputError(f'{path} has {most} columns, more than {MOST_ENTRIES}')
+                told = f'{path} has {most} columns, more than {MOST_ENTRIES}'
+                raise InputError(f'{told}: leave out those that are not needed')
             width, before = next((len(row) for _, row in reversed(rows) if row), width), line
             if block := [(above + last, row) for last, row in rows if any(row)]:
                 yield block

@@ -108,11 +108,12 @@ class Foreign:
         joints = log.columns()
         if 'q1' not in joints.cells:
             count = 0 if self.chain is None else len(self.chain.joints)
-            like = like_joints(log.names, count) or {'q*': 'NAME*'}
-            raise InputError(
-                f'{log.path} has no column q1; {log.has}: give {option(like, like.values())} or '
-                '--joints-preset'
-            )
+            like = like_joints(log.names, count)
+            advice = option(like or ('q*',), like.values() or ('NAME*',))
+            if not like:
+                advice += ' (of a program, write its joint values to a table: a row for each pose)'
+            advice = f'give {advice} or --joints-preset'
+            raise InputError(f'{log.path} has no column q1; {log.has}: {advice}')
         matched, partners = _partners(table, log)
         if not {*MEASURED_COLUMNS} & {*made.cells}:
             raise InputError(

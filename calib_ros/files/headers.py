@@ -60,7 +60,8 @@ def places(header: Sequence[str], name: str) -> list[int]:
     usual = [
         k
         for k, cell, bare, unit in parts
-        if name == cell or (name == bare and unit in UNIT_SIGNS and cell.endswith((']', ')')))
+        if name == cell
+        or (name == bare and unit in UNIT_SIGNS and cell.endswith((']', ')', '\uff09')))
     ]
     return usual or [k for k, _, bare, _ in parts if name == bare]
 
@@ -114,10 +115,11 @@ def named_by_option(
     """
     low = [name.lower() for name in header]
     if several := [name for name in missing if low.count(name) > 1]:
-        first, *again = (f'#{k}' for k, name in enumerate(low, 1) if name == several[0])
+        ways = [[f'#{k}' for k, n in enumerate(low, 1) if n == name] for name in several]
+        given = ', or '.join(option(several, each) for each in zip(*ways, strict=False))
         return (
             f'Several columns are called {", ".join(several)}: rename all but one, or give each '
-            f'by its number: --columns {several[0]}={first} (or {", ".join(again)})'
+            f'by its number: {given}'
         )
     if len(numbers := numbers_in(header)) >= len(missing):
         given = option(missing, numbers[: len(missing)])

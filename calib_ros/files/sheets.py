@@ -207,7 +207,7 @@ def _refuse_shifted(columns: Columns, width: int) -> None:
                 raise InputError(
                     f'{columns.path}, line {line}: more cells than the {width} columns of its '
                     'header: name each column there; a doubled separator, a thousands mark or a '
-                    'decimal comma also makes one more'
+                    'decimal comma also makes one more (save it with semicolons between cells)'
                 )
 
 

@@ -75,7 +75,7 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
     count = Counter(map(str.lower, found.cells))
     low = {name: name.lower() for name in found.cells if count[name.lower()] == 1}
     meant = {name: ours for name, ours in low.items() if ours in WORDS and ours != name}
-    if not {*QUATERNION} & {*low.values()}:
+    if not {*QUATERNION} & {*found.cells}:
         meant |= {name: ours for ours, name in quaternions_in(found.header).items()}
     cells = {meant.get(name, name): given for name, given in found.cells.items()}
     found = replace(found, cells=cells)

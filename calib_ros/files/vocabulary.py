@@ -20,15 +20,20 @@ UNIT_SIGNS = {word + s: unit for word, unit in LONG.items() for s in ('', 's')}
 UNIT_SIGNS |= {'°': 'deg', 'º': 'deg', '˚': 'deg', 'gradi': 'deg'}  # Grad may be gon
 UNIT_SIGNS |= {'µm': 'um', 'μm': 'um', 'inch': 'in', 'inches': 'in'}
 UNIT_SIGNS |= {'foot': 'ft', 'feet': 'ft'}
+UNIT_SIGNS |= {'毫米': 'mm', '厘米': 'cm', '度': 'deg', '弧度': 'rad'}
 UNIT_SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
 """Units by their signs and words in small letters."""
 _ANY = '|'.join(UNIT_SIGNS)
 _WORDS = '|'.join(sign for sign in UNIT_SIGNS if sign not in ('m', 'in', 'ft'))
 UNIT = re.compile(
-    rf'(.*[^\s,/_]) *(?:[\[(](?![0-9,]+[\])])([^\[\]()]+)[\])]|[,/] *({_ANY})|[-_ ]({_WORDS}))',
+    rf'(.*[^\s,/_]) *(?:[\[(\uff08](?![0-9,]+[\])])([^\[\]()\uff08\uff09]+)[\])\uff09]'
+    rf'|[,/] *({_ANY})|[-_ ]({_WORDS}))',
     re.I,
 )
-"""A name with its unit: X [mm], X (mm), X / mm, X_mm, X-mm; brackets may hold something else."""
+"""A name with its unit: X [mm], X (mm), X / mm, X_mm, X-mm; brackets may hold something else.
+
+Wide ones of Chinese and Japanese texts count, too.
+"""
 UNITS_ARE = re.compile(
     r'\b(?:(?:unit[aeéà]?s?|unidade?s?|\w*einheit(?:en)?)(?: (?:of|di|de) \w+)?'
     rf'(?:\W*[:=\t]\W*(?:in \W?(?=(?:{_ANY})(?!\w)))?'

@@ -221,6 +221,7 @@ def test_sessions_come_in_the_order_asked_for(tmp_path):
             'q1,q2,x,y,z,qx,qy,qz,qw,roll,pitch,yaw\n0,0,1,2,3,0,0,0,1,0,0,0\n',
             'columns not read: roll, pitch, yaw (',
         ),
+        ('q1,q2,x,y,z,QX,QY,QZ,QW\n0,0,1,2,3,0,0,0,1\n', ' is read as q'),
         ('q1,q2,x,y,z,q_w,,robot\n0,0,1,2,3,1,,left\n', 'columns not read: q_w, robot ('),
     ],
 )
@@ -228,7 +229,7 @@ def test_columns_that_someone_may_have_wanted_are_told(tmp_path, text, said):
     path = tmp_path / 'cell.csv'
     path.write_text(text)
     warnings = read_table(path, 2).warnings
-    assert len(warnings) == bool(said)
+    assert len(warnings) == bool(said) * (4 if 'QX' in text else 1)
     assert all(said in each for each in warnings)
 
 
