@@ -27,6 +27,7 @@ from calib_ros.decision.steps import EXPLAINED
 from calib_ros.errors import CalibrationError, InputError
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.fitting import fit
+from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, NEARER, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
@@ -35,9 +36,10 @@ from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.inverse import Aim
 from calib_ros.kinematics.parameter import DELAY, IN_A_FRAME, LENS_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
-from calib_ros.settings import EXACT, EXCEPTION, Settings
+from calib_ros.settings import EXACT, EXCEPTION, LEVER, Settings
 from calib_ros.shown import some
 
 HARMFUL = 0.15
@@ -256,13 +258,20 @@ def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | 
     if any(each.pixels is not None for each in problem.sets):
         return None
     bases = sorted({each.base for each in problem.sets})
-    late, chain = problem.with_sets(map(_with_moves, problem.sets)), result.chain
+    chain, delays = result.chain, [Parameter(name, DELAY) for name in bases]
     for name in bases:
         chain = chain.with_frame(name, replace(chain.frame(name), delay=0.0))
-    delays = [Parameter(name, DELAY) for name in bases]
-    share = explained_share(late, chain, result.names, delays)
-    if share < EXPLAINED:
+    sets = [*map(_with_moves, problem.sets)]
+    few = [each.spread() for each in sets]
+    shares = [
+        explained_share(problem.with_sets(some), chain, result.names, delays)
+        for some in (few, [_straight(result.chain, each) for each in few])
+    ]
+    if (share := max(shares)) < EXPLAINED:
         return None
+    if share > shares[0]:
+        sets = [_straight(result.chain, each) for each in sets]
+    late = problem.with_sets(sets)
     play = [name for name in effects.members(chain, 'backlash') if name not in result.names]
     played = explained_share(late, chain.with_effects(play), result.names, play)
     if played > share:
@@ -285,6 +294,16 @@ def _with_moves(each: Observations) -> Observations:
     moves[order[1:]] = np.diff(each.joints[order], axis=0)
     signs = np.sign(moves) if each.approach is None else each.approach
     return replace(each, velocity=moves, approach=signs, delay=np.zeros(len(each)))
+
+
+def _straight(chain: Chain, each: Observations) -> Observations:
+    """Return poses whose last moves, as velocity, lead straight back: a smoothed target does."""
+    ends, part = (each.base, each.tool), slice(6 if each.oriented.all() else 3)
+    there = chain.forward(each.joints - np.asarray(each.velocity), None, *ends)
+    place, axes = there[:, :3, 3].T, there[:, :3, :3].transpose(2, 1, 0)
+    error, slopes = Aim(chain, *ends).linearise(each.joints.T, None, place, axes, LEVER)
+    back = np.linalg.pinv(slopes[:, part].T, DEGENERATE)
+    return replace(each, velocity=-np.einsum('bip,pb->bi', back, error[part]))
 
 
 def _sigmas(problem: Problem, result: Identification) -> str:
