@@ -90,7 +90,8 @@ class Columns:
         words = bare.lower() not in MISSING and not re.search('[0-9]', bare)
         words |= re.match(r'#|%|//|[^\W\d_]{2}', bare) is not None  # Run 2, # page 2
         if words and row == 0:  # perhaps, as other tables have below their header
-            remedy += '; units belong into the header: q1 [deg]'
+            told = '' if bare.strip('[]()').lower() in UNIT_SIGNS else f'{remedy}; '
+            remedy = f'{told}units belong into the header: q1 [deg]'
         return (ColumnsError if words or (commas and not row) else InputError)(
             f'{self.where(row, called)} must be a finite number, not {text!r}: {remedy}'
         )

@@ -363,7 +363,7 @@ def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
             refused = refused or (
                 f'{table.path}: "{wrong[0]}" of its column {name} must be in one row here and in '
                 f'one of {log.path} (column {theirs}): correct it or leave it out; if all rows '
-                'stand side by side, rename the column in one of them'
+                'stand side by side, leave that column out of one of them'
             )
     if refused:
         raise InputError(refused)

@@ -248,7 +248,7 @@ def test_a_line_of_units_below_our_own_columns_is_read(tmp_path):
     (found,) = loading.table(tmp_path / 'cell.csv', chain, Settings()).fitted
     np.testing.assert_allclose(found.joints, [[np.pi / 2, np.pi]])
     np.testing.assert_allclose(found.positions, [[1e-3, 2e-3, 3e-3]])
-    with pytest.raises(InputError, match='units belong into the header'):
+    with pytest.raises(InputError, match="not 'deg': units belong into the header"):
         read_table(tmp_path / 'cell.csv', 2)
 
 
