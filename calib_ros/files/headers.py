@@ -154,7 +154,7 @@ def named_by_option(
         more = f' --length {unit[0]}{more}'
     found = (like or ({'q*': 'NAME*'} if whole else dict.fromkeys(lacking, 'NAME'))) | found
     given = option(found, found.values())
-    if len(given) > LONGEST // 3:  # a message would lose its middle
+    if len(given) > LONGEST // 3 or '{' in ''.join(found.values()):  # cut, or not readable
         short = {name: f'#{k}' for k, name in reversed([*enumerate(header, 1)])}
         given = option(found, [short.get(each, each) for each in found.values()])
     perhaps = OTHER_ARM + OF_ABB * ([*names[4:]] == lacking)

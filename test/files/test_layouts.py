@@ -96,6 +96,7 @@ def test_what_is_no_expression(text):
             'Is it another arm (--chain)? Columns of other names: --columns "q2=NAME"',
         ),
         (['q1', 'q2', 'X', 'X', 'y'], 'number: --columns "x=#3", or --columns "x=#4"'),
+        (['q1', 'q2', 'X {mm}', 'y', 'z'], 'other names: --columns "x=#3"'),
         (['q1', 'J1', 'J2', 'y', 'z'], 'other names: --columns "q*=J*"'),
         (['J1 [°]', 'J2 [°]', 'x [mm]', 'y (mm)', 'z / mm'], 'other names: --columns "q*=J*"'),
         (['q0', 'q1', 'x', 'y', 'z'], '--columns "q1=q0,q2=q1"'),
@@ -248,7 +249,7 @@ def test_a_line_of_units_below_our_own_columns_is_read(tmp_path):
     (found,) = loading.table(tmp_path / 'cell.csv', chain, Settings()).fitted
     np.testing.assert_allclose(found.joints, [[np.pi / 2, np.pi]])
     np.testing.assert_allclose(found.positions, [[1e-3, 2e-3, 3e-3]])
-    with pytest.raises(InputError, match="not 'deg': units belong into the header"):
+    with pytest.raises(InputError, match="not 'mm': units belong into the header"):
         read_table(tmp_path / 'cell.csv', 2)
 
 
