@@ -95,9 +95,11 @@ class Guide:
     def figures(self) -> dict[str, Any]:
         """Return the diagnostics: progress of sampling, and the last trajectory."""
         estimate = self._session.estimate
-        wanted = self._session.settings.wanted_accuracy
+        settings = self._session.settings
+        if estimate is not None and estimate.astray(settings.largest_error):
+            estimate = None
         known = {} if estimate is None else {'expected [mm]': f'{1e3 * estimate.sigma:.4f}'}
-        enough = estimate is not None and estimate.enough(wanted)
+        enough = estimate is not None and estimate.enough(settings.wanted_accuracy)
         return known | {'enough samples': enough, 'last trajectory': self._last_trajectory}
 
     def advise(self) -> None:

@@ -12,6 +12,7 @@ from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from ros_cell import PATIENCE, STOPS, Cell, joint_messages, part, pose_messages, topics, values_of
 from sensor_msgs.msg import JointState, PointCloud2, Range
+from sessions import samples
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -55,6 +56,14 @@ def test_the_next_pose_follows_the_samples_and_is_latched(cell, recording):
     for message in (*early, *late):
         assert (limits[:, 0] <= message.position).all()
         assert (message.position <= limits[:, 1]).all()
+
+
+@pytest.mark.parametrize('unit', [1.0, 1e3])
+def test_no_accuracy_is_expected_in_figures_of_poses_that_fit_no_arm(cell, truth, unit):
+    taken = [replace(s, position=unit * s.position) for s in samples(8, true=truth)]
+    cell.node.session.restore(taken)
+    cell.node.session.status()
+    assert ('expected [mm]' in cell.node._guide.figures()) == (unit == 1.0)
 
 
 def test_an_estimate_that_takes_long_holds_up_nothing(cell, recording, monkeypatch):
