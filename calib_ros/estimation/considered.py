@@ -44,6 +44,7 @@ def considered(chain: Chain, names: Sequence[str], fixed: Sequence[str] = ()) ->
     """
     every = [name for group in CONSIDERED for name in effects.members(chain, group)]
     every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
+    every += [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
     held = {n for each in fixed for n in fnmatch.filter(chain.parameter_names, each)}
     every += [name for name in chain.parameter_names if name in held and name.of_dh]
     every += [*lenses(chain), *held_frames(chain)]

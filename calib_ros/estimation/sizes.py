@@ -21,7 +21,7 @@ TYPICAL = {
     'coupling': 1e-3,
     'frame': 1e-3,
 }
-TYPICAL |= {group: EXPECTED[group] for group in ('gravity', 'compliance', 'backlash')}
+TYPICAL |= {group: EXPECTED[group] for group in ('ratio', 'gravity', 'compliance', 'backlash')}
 """Size [m, rad] of the errors that arms, and frames said to be known, have, by group."""
 SPREAD = 10.0
 """Factor between the error sizes of one arm and TYPICAL (one standard deviation;
