@@ -53,7 +53,8 @@ def size_group(chain: Chain, name: str) -> str | None:
     """Return the group of parameters with errors of one size; None for unknown frames."""
     if chain.owns_frame(name):
         return 'frame' if name in held_frames(chain) else None
-    return _group(name)
+    linear = [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
+    return 'drive' if _group(name) == 'ratio' and name not in linear else _group(name)
 
 
 @lru_cache(maxsize=1024)

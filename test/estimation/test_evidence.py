@@ -235,7 +235,7 @@ def test_errors_are_of_one_size_by_group():
         ('base.x', None),
         ('elbow_joint.a', 'length'),
         ('elbow_joint.beta', 'angle'),
-        ('elbow_joint.ratio', 'ratio'),
+        ('elbow_joint.ratio', 'drive'),
         ('elbow_joint.sin_1', 'drive'),
         ('wrist_1_joint.coupling_elbow_joint', 'coupling'),
         ('elbow_joint.gravity_wrist_1_joint', 'gravity'),
