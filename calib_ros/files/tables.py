@@ -75,6 +75,8 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
     count = Counter(map(str.lower, found.cells))
     low = {name: name.lower() for name in found.cells if count[name.lower()] == 1}
     meant = {name: ours for name, ours in low.items() if ours in WORDS and ours != name}
+    if {*POSITION} <= {*low.values()} and not {*POSITION} & {*low}:
+        raise ColumnsError(f'{path} has no column x, y, z, but X, Y, Z: rename them')
     if not {*QUATERNION} & {*found.cells}:
         meant |= {name: ours for ours, name in quaternions_in(found.header).items()}
     cells = {meant.get(name, name): given for name, given in found.cells.items()}

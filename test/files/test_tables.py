@@ -295,6 +295,10 @@ def test_distances_beside_coordinates_are_no_measurements_of_their_own(tmp_path,
     table = loading.table(path, arm, Settings())
     assert [len(each) for each in table.fitted] == [2]
     assert 'is left out: x, y, z are in all of its rows' in table.warnings[-1]
+    path.write_text(f'q1,q2,X,Y,Z,{column}\n0,0,1,2,3,4\n')  # X, Y, Z were not read at all
+    (found,) = loading.table(path, arm, Settings()).fitted
+    assert found.distances is None
+    assert found.positions[0, 0] == (1e-3 if 'mm' in column else 1.0)
 
 
 @pytest.mark.parametrize('separator', [',', ';'])
