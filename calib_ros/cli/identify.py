@@ -35,13 +35,14 @@ from calib_ros.report.advice import BRINGS, FAR, Advice
 from calib_ros.report.page import Origin, markdown
 from calib_ros.report.poses import poses_of, poses_to_verify
 from calib_ros.sampling.dataset import with_lenses
-from calib_ros.settings import Settings, refuse_other_units
+from calib_ros.settings import Settings, refuse_larger
 from calib_ros.shown import of_them, rounded
 from calib_ros.texts import dump_json
 
 PAGES = ('report.html', 'report.md', 'residuals.csv', 'before_after.png')
 RESULT_FILES = ('calibration.yaml', 'result.json', 'settings.yaml', *PAGES)
 REPORTS = (*PAGES, 'report.pdf')
+TOUCH_SIGMA = {'upper': 1.0, 'text': 'standard deviation of heights over touched planes [m]'}
 NOT_OF_UPDATES = ('history', 'tolerance', 'model', 'fixed', 'priors', 'folds')
 
 
@@ -167,7 +168,7 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settin
     chain = boards.posed_arm() if posed else load_chain(options.chain)
     settings = common.settings_of(options)
     touch = options.sigma_touch
-    refuse_other_units('sigma_touch', touch or 0.0, '[m]')
+    refuse_larger('sigma_touch', touch or 0.0, TOUCH_SIGMA)
     touched: dict[str, Any] = {} if touch is None else {'sigma_touch': touch}
     if options.detections is not None:
         return _detected(options, chain, settings, touched, screen), settings

@@ -38,7 +38,11 @@ def bad_inputs():
     yield 'nothing left', (*good, '--fixed', '*'), 'every parameter is fixed: nothing is left to'
     for wrong in ('0', '-1', '-1e-3', 'nan', 'inf', '300'):
         yield f'tolerance {wrong}', (*good, '--tolerance', wrong), '--tolerance must be between 0'
-    yield 'heights in mm', (*good, '--sigma-touch', '50'), 'at most 1 [m], not 50: 1 mm is 0.001'
+    yield (
+        'heights in mm',
+        (*good, '--sigma-touch', '50'),
+        'at most 1, not 50 (standard deviation of',
+    )
     yield ('useless option', (*good, '--sources', '/pose'), '--sources does not apply to a table')
     yield 'new base', (*good, '--new-base'), '--new-base needs --previous'
     yield 'growth', (*good, '--growth', '30'), '--growth needs --previous'
