@@ -62,12 +62,11 @@ class Rows:
         self._stamps[: len(stamps)] = stamps
         self.count = len(stamps)
 
-    def sort(self, one: bool = False, least: int = 0) -> tuple[int, int]:
-        """Sort the rows by stamp; return how many were dropped as equal or contrary.
+    def sort(self) -> tuple[int, int]:
+        """Sort the rows by stamp, one row each; return how many were dropped as equal or contrary.
 
-        Of equal ones with a stamp the one with most values is kept, of contrary ones none: a clock
-        may have been set back. Of these, too, `one` is kept, or the last one if fewer rows than
-        `least` remain, by its values, so that the order of arrival does not matter.
+        Of equal stamps the row with most values is kept, or the smallest values, so that the order
+        of arrival does not matter.
         """
         if (np.diff(self.stamps) > 0).all():
             return 0, 0
@@ -77,15 +76,8 @@ class Rows:
         after, before = self.values[order[1:][again]], self.values[order[:-1][again]]
         near = np.isclose(after, before, AS_FLOATS, AS_FLOATS)
         near = (near | np.isnan(after) | np.isnan(before)).all(axis=1)
-        first = np.append(True, ~again)
-        group = np.cumsum(first) - 1
-        doubtful = np.zeros(group[-1] + 1, dtype=bool)
-        doubtful[group[1:][again][~near]] = not one
-        kept = first & ~doubtful[group]
-        kept[np.flatnonzero(first)[-1]] |= kept.sum() < least
-        contrary = int((doubtful[group] & ~kept).sum())
-        self.keep(order[kept])
-        return len(order) - int(kept.sum()) - contrary, contrary
+        self.keep(order[np.concatenate([[True], ~again])])
+        return int(near.sum()), int((~near).sum())
 
 
 TOO_LATE = 'measurements: later than lateness allows'

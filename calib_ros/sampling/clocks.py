@@ -102,7 +102,7 @@ class Clocks:
     def _evaluate(self) -> None:
         joints, poses = self._joints, self._poses.values()
         for rows in (joints, *poses):
-            rows.sort(one=True)
+            rows.sort()
         measured = [(rows.stamps, rows.values) for rows in poses]
         stand = np.ptp(joints.values, axis=0).max() <= self.settings.still
         deaf = stand and bool(poses) and all(map(self._moves_much, poses))

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from calib_ros.kinematics.se3 import Index
-from calib_ros.sampling.buffers import Waiting
+from calib_ros.sampling.buffers import Rows, Waiting
 from calib_ros.sampling.hints import Hint, apart, ended, restless, sparse
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.sampler import ROW_WIDTH, TWICE, Found, Numbered, Sampler
@@ -275,9 +275,12 @@ class Collector:
         self.track.release(min(plan.done_ns, self._complete_ns) - margin)
 
     def _sort(self) -> None:
-        found = [(JOINTS, self.track.sort())]  # image numbers always differ
-        found += [(POSES, rows.sort(one=key.images)) for key, rows in self.waiting.items()]
-        for kind, (equal, contrary) in found:
+        kept: list[tuple[str, Track | Rows, bool]] = [(JOINTS, self.track, False)]
+        kept += [(POSES, rows, key.images) for key, rows in self.waiting.items()]
+        for kind, rows, numbered in kept:
+            equal, contrary = rows.sort()
+            if numbered:  # image numbers always differ
+                equal, contrary = equal + contrary, 0
             self.unused += Counter({f'{kind}: {TWICE}': equal})
             self.dropped += Counter({f'{kind}: {CONTRARY}': contrary})
 

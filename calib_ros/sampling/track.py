@@ -93,8 +93,8 @@ class Track:
         rows.extend(stamps, values)
 
     def sort(self) -> tuple[int, int]:
-        """Sort all samples, as `Rows.sort`; of each publisher one is left."""
-        dropped = [rows.sort(least=1) for rows in self._parts.values()]
+        """Sort all samples, as `Rows.sort`."""
+        dropped = [rows.sort() for rows in self._parts.values()]
         return sum(equal for equal, _ in dropped), sum(contrary for _, contrary in dropped)
 
     def at(self, stamps: Stamps, standing: bool = False) -> Motion:

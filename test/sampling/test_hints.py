@@ -254,12 +254,11 @@ def test_messages_of_other_joints_are_no_loss(names, lost):
 
 
 def test_two_publishers_are_told_rather_than_what_comes_of_them():
-    """Zeros with the stamps of the true joint values: nothing is sampled."""
+    """Zeros with the stamps of the true joint values: some stops seem to move."""
     motion = tour(25)
     made = heard(motion, 49.5, twice='joints', other=-motion(np.arange(0.0, 49.5, 0.01)))
-    assert 'two publishers' in made.status()
     made.finish()
-    assert not made.samples
+    assert made.account().dropped['measurements: a stop with more spread than noise'] > 100
     (warning,) = told(made)
     assert 'two publishers' in warning
 
@@ -279,7 +278,7 @@ def test_other_values_with_the_same_stamp_are_told(of, other, count):
     warnings = told(made)
     assert len(warnings) == count
     for words in warnings:
-        said = rf'100 % of the {of} were dropped .*: different values with the same stamp'
+        said = rf'[45]\d % of the {of} were dropped .*: different values with the same stamp'
         assert re.match(said, words)
 
 
