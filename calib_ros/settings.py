@@ -56,9 +56,7 @@ def refuse_larger(name: str, value: float, setting: Mapping[str, Any]) -> None:
 class Limits:
     """Limits of a correction of joint commands."""
 
-    largest_turn: float = _setting(
-        0.1, 'largest correction of a revolute joint [rad]', upper=math.pi
-    )
+    largest_turn: float = _setting(0.1, 'largest correction of a revolute joint [rad]', upper=3.2)
     largest_shift: float = _setting(0.05, 'largest correction of a prismatic joint [m]', upper=1.0)
     largest_position_error: float | None = _setting(
         None,
@@ -70,7 +68,7 @@ class Limits:
         None,
         f'orientation error that may remain [rad]; default: 1e-6, or {TURN_IN_PART} for arms '
         'that cannot reach every orientation',
-        upper=math.pi,
+        upper=3.2,
     )
     orientation_weight: float | None = _setting(
         None,
@@ -93,7 +91,7 @@ class Settings:
         1e-4 / LEVER,
         'standard deviation of orientations that come without a covariance [rad]',
         1e-9,
-        math.pi,
+        3.2,
     )
     sigma_pixel: float = _setting(
         0.3, 'standard deviation of a corner coordinate in an image [px]', 1e-6
@@ -149,7 +147,7 @@ class Settings:
         0.05, 'a larger change of a length is not accepted: wrong robot? [m]', 1e-9, 1.0
     )
     largest_angle: float = _setting(
-        0.1, 'a larger change of an angle is not accepted: wrong robot? [rad]', 1e-9, math.pi
+        0.1, 'a larger change of an angle is not accepted: wrong robot? [rad]', 1e-9, 3.2
     )
     largest_error: float = _setting(
         0.01, 'a larger RMS error on held-out poses is not accepted: wrong robot? [m]', 1e-9, 1.0

@@ -187,16 +187,19 @@ def judge(
     tolerance: float | None = None,
     confidence: float = CONFIDENT,
     lost: int = 0,
+    of_messages: bool = False,
 ) -> Judgement:
     """Judge a calibrated arm by its errors at new measurements, in its frames if not given.
 
     Each configuration counts once, however often it was measured; fitted frames have absorbed the
-    errors of `lost` ones. Without a `tolerance` [m] the limit is that of the calibration.
+    errors of `lost` ones. Without a `tolerance` [m] the limit is that of the calibration. Remedies
+    of a mistake are those of messages or of tables.
     """
     found = found or along_base(compare(arm.before, arm.chain, sets), arm.chain, sets)
     moments = moments_of(found.after.position, found.before.configurations)
     rms, numbers, freedom, lower, upper = limits_of(moments, lost, confidence, DECIDING)
-    mistake = _mistake(arm, sets, rms, 1e-3 * (found.figures[1].rms_mrad or 0.0))
+    angle = 1e-3 * (found.figures[1].rms_mrad or 0.0)
+    mistake = _mistake(arm, sets, rms, angle, of_messages)
     reused, limit = arm.reused(sets), tolerance or arm.limit(sets, found.figures[0].rms_mm)
     verdict: Verdict = 'no verdict'
     if limit is not None and not mistake:
@@ -220,11 +223,11 @@ def judge(
 
 
 def _mistake(
-    arm: Calibration, sets: Sequence[Observations], error: float, angle: float
+    arm: Calibration, sets: Sequence[Observations], error: float, angle: float, of_messages: bool
 ) -> mistakes.Diagnosis | None:
     if error <= Settings.largest_error and angle <= Settings.largest_angle:
         return None
-    problem = Problem(arm.before, sets[0], more=sets[1:])
+    problem = Problem(arm.before, sets[0], more=sets[1:], of_messages=of_messages)
     found = mistakes.diagnose(problem, far=True) or mistakes.diagnose_alone(problem, arm.chain)
     known = error > Settings.largest_error or (found and found.alone)  # else positions fit
     return found if known else None

@@ -106,7 +106,9 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
     else:
         _show_update(found, screen)
         if options.out is not None:
-            screen.say(common.written(options.out, contents))
+            stays = not found.accepted and 'calibration.yaml' in contents
+            told = f'wrote {options.out / "result.json"}'
+            screen.say(told if stays else common.written(options.out, contents))
     return 0 if found.accepted else common.Status.NOT_ACCEPTED
 
 

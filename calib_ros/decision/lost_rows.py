@@ -103,10 +103,10 @@ def other_order(
     one_way = steps.any(axis=0) & ((steps >= 0).all(axis=0) | (steps <= 0).all(axis=0))
     if errors[0] < CONFIDENT * errors[best] or not one_way.any():
         return None
-    name = (*nominal.joint_names, *'xyz')[one_way.argmax()]
+    names = ', '.join(np.array([*nominal.joint_names, *'xyz'])[one_way])
     what = 'the joint values fit the measurements no better than in any other order of the rows'
-    remedy = 'was it sorted without the others? Export them again, and sort whole rows'
-    return Suspect(f'{what}, and {name} goes one way from row to row', remedy), np.nan
+    remedy = 'was one sorted without the others? If so, export them again, and sort whole rows'
+    return Suspect(f'{what}, and one way from row to row goes {names}', remedy), np.nan
 
 
 def in_any_order(chain: Chain, seen: Observations, of_images: bool) -> Iterator[Suspect]:

@@ -315,7 +315,7 @@ class CalibrationNode(Batched):
         self, given: tuple[Calibration, list[Observations], Callable[..., str]]
     ) -> Answer:
         calibration, sets, filed = given
-        found = judge(calibration, sets)
+        found = judge(calibration, sets, of_messages=True)
         row = partial(verification_row, calibration.chain, found, kind='validate')
         text = words.verdict_in_words(found) + filed(row, table_hash(calibration.chain))
         return found.verdict == 'holds', text
@@ -324,7 +324,7 @@ class CalibrationNode(Batched):
         calibration, problem = found
         years = years_since(calibration.record, problem.all_sets)
         updated = recalibrate(calibration, problem, years)
-        return words.still_holds(updated, judge(calibration, problem.all_sets))
+        return words.still_holds(updated, judge(calibration, problem.all_sets, of_messages=True))
 
     def _on_clear(self, request: Any) -> Answer:
         count = len(self.session.samples)

@@ -283,7 +283,7 @@ def progress(
         apart = f'{1e3 * estimate.rms:.0f} mm from where the joints are'
         if not estimate.excess or estimate.rms <= settings.largest_error:
             apart = 'which do not fit this arm'
-        told += f', {apart}: check units, clocks and chain'
+        told += f', {apart}: check units, clocks, sigmas and chain'
     elif estimate is not None:
         told += f', {1e3 * estimate.sigma:.3f} mm expected, {_forecast(estimate, settings)}'
     still = barely_moved(chain, np.array(fitted)) if fitted else ()

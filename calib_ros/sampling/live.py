@@ -69,8 +69,9 @@ class Estimate:
         return self.excess is not None and self.sigma <= wanted
 
     def astray(self, largest_error: float) -> bool:
-        """Tell whether positions, or what would explain them, are further off than any arm [m]."""
-        return max(self.misfit, self.rms if self.excess else 0.0) > largest_error
+        """Tell whether positions, or the arm that explains them, are further off than any [m]."""
+        left = self.rms if self.excess else 0.0
+        return max(left, min(self.misfit, self.sigma)) > largest_error
 
     def more_for(self, wanted: float) -> int:
         """Return how many more samples are expected for a wanted sigma [m]."""

@@ -283,7 +283,7 @@ def test_approaches_are_the_last_moves():
         ({'largest_shift': np.inf}, 'largest_shift must be a positive number, not inf'),
         ({'largest_change': np.nan}, 'largest_change must be of type float, not nan'),
         ({'orientation_weight': -1.0}, 'orientation_weight must be a positive number'),
-        ({'largest_turn': 5.0}, r'must be at most 3.142, not 5 .*\[rad\]'),
+        ({'largest_turn': 5.0}, r'must be at most 3.2, not 5 .*\[rad\]'),
         ({'largest_position_error': 50.0}, r'at most 1, not 50 .*\[m\]'),
         ({'tool': (0.0, 0.0)}, r'tool must be of type .* not \(0.0, 0.0\)'),
         ({'tool': (0.0, np.inf, 0.0)}, 'tool must be within 5 m'),

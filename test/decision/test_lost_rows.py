@@ -76,8 +76,12 @@ def test_rows_lost_before_the_first_and_again_later_are_not_told_as_one():
         (sorted(range(40), key=str), 'joint values are sorted as text (0, 1, 10 ...)', True),
         ([int(k) - 1 for k in sorted(map(str, range(1, 41)))], 'sorted as text (1, 10, 1', True),
         (np.argsort(sorted(range(40), key=str)), 'measurements are sorted as text (0, 1, ', True),
-        ('elbow_joint', 'any other order of the rows, and elbow_joint goes one way', False),
-        ('x', 'any other order of the rows, and x goes one way from row to row', False),
+        (
+            'elbow_joint',
+            'any other order of the rows, and one way from row to row goes elbow_joint',
+            False,
+        ),
+        ('x', 'any other order of the rows, and one way from row to row goes x', False),
     ],
 )
 @pytest.mark.parametrize('oriented', [True, False])

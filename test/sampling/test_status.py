@@ -113,7 +113,9 @@ def test_no_accuracy_is_expected_of_positions_in_millimetres():
 def test_positions_in_millimetres_are_told_however_few_they_are(count):
     """ "2717202 mm expected": they were explained by lengths of which no arm is."""
     made = session([replace(each, position=1e3 * each.position) for each in samples(count)])
-    assert f'{count} poses, which do not fit this arm: check units' in made.status()
+    assert (
+        f'{count} poses, which do not fit this arm: check units, clocks, sigmas' in made.status()
+    )
     assert made.doubtful
     assert 'expected' not in made.status()
     assert 'expected' in session(samples(count)).status()
