@@ -11,7 +11,7 @@ from datetime import timedelta
 from itertools import pairwise
 from statistics import median_low
 
-from calib_ros.apply.confidence import Drift, drift
+from calib_ros.apply.chart import Drift, drift
 from calib_ros.errors import CalibrationError
 from calib_ros.estimation.levels import SEVERAL
 from calib_ros.files.history import History

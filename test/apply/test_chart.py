@@ -9,7 +9,8 @@ import pytest
 from verified import with_errors
 
 from calib_ros.apply import simulation
-from calib_ros.apply.confidence import drift, judge, rms_interval, run_length
+from calib_ros.apply.chart import drift, run_length
+from calib_ros.apply.confidence import judge, rms_interval
 from calib_ros.apply.verification import verify
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import invert

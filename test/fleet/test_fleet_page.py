@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import plants
 
-from calib_ros.apply.confidence import drift
+from calib_ros.apply.chart import drift
 from calib_ros.decision.changes import Explanation
 from calib_ros.files.rows import Row
 from calib_ros.fleet.page import fleet_page
