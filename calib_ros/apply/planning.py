@@ -17,7 +17,7 @@ are undefined while M is singular: exchanges then start from the choice by `d`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -317,8 +317,10 @@ def fewest(choice: Choice, wanted: float) -> Index:
     That is the predicted RMS position error [m] at the poses of the task.
     """
     candidates, task = choice.candidates, choice.task
-    assert task is not None
-    excited = choice.design.determined_by(candidates)
+    if task is None:
+        raise InputError('give the poses at which the accuracy is wanted, as the task')
+    choice = replace(choice, design=choice.design.determined_by(candidates))
+    excited = choice.design
     best = predicted(excited.after(candidates), task)
     if best > wanted:
         raise InputError(

@@ -44,11 +44,16 @@ def considered(chain: Chain, names: Sequence[str], fixed: Sequence[str] = ()) ->
     """
     every = [name for group in CONSIDERED for name in effects.members(chain, group)]
     every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
-    every += [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
+    every += travels(chain)
     held = {n for each in fixed for n in fnmatch.filter(chain.parameter_names, each)}
     every += [name for name in chain.parameter_names if name in held and name.of_dh]
     every += [*lenses(chain), *held_frames(chain)]
     return tuple(name for name in every if name not in names)
+
+
+def travels(chain: Chain) -> list[Parameter]:
+    """Return the ratios of linear joints: their travel may be out of scale."""
+    return [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
 
 
 def held_frames(chain: Chain) -> list[Parameter]:
@@ -151,8 +156,7 @@ def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], f
     sets = [each for each in sets if not (each.socket or each.plane)]
     if not (sets or system.separations):
         return chain, {}, SCALE
-    travels = [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
-    chain = chain.with_effects(travels)
+    chain = chain.with_effects(travels(chain))
     names: list[str] = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
     names += [name for joint in chain.joints for name in joint.parameters if name.is_length]
     scale = SCALE
@@ -163,7 +167,7 @@ def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], f
         scale = PRINTED
     elif all(each.distances is not None for each in sets):
         scale = LARGEST_SCALE
-    return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}, scale
+    return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels(chain)}, scale
 
 
 def _waves(chain: Chain, nuisances: Nuisances) -> int:

@@ -33,6 +33,7 @@ from calib_ros.estimation.considered import (
     lengths_of,
     lenses,
     nuisance_products,
+    travels,
 )
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
@@ -53,8 +54,8 @@ def size_group(chain: Chain, name: str) -> str | None:
     """Return the group of parameters with errors of one size; None for unknown frames."""
     if chain.owns_frame(name):
         return 'frame' if name in held_frames(chain) else None
-    linear = [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
-    return 'drive' if _group(name) == 'ratio' and name not in linear else _group(name)
+    group = _group(name)
+    return 'drive' if group == 'ratio' and name not in travels(chain) else group
 
 
 @lru_cache(maxsize=1024)

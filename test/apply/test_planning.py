@@ -193,6 +193,8 @@ def test_so_many_poses_are_needed_and_no_fewer(criterion, wanted):
     assert accuracy(design, q[found], task)[-1] <= wanted < best(len(found) - 1)
     with pytest.raises(InputError, match='all 200 candidates together'):
         planning.fewest(Choice(design, q, 'd', task), 1e-6)
+    with pytest.raises(InputError, match='give the poses at which'):
+        planning.fewest(Choice(design, q), 1e-3)
 
 
 def travel(q, order, speeds):
