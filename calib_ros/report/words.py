@@ -160,6 +160,8 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
 def still_holds(updated: Recalibration, found: Judgement) -> tuple[bool, str]:
     """Return whether a calibration holds at the last stops, and why."""
     text = f'RMS {1e3 * found.rms:.3f} mm at the last {counted(found.configurations, "pose")}'
+    if found.mistake:
+        return False, verdict_in_words(found)
     if updated.changed:
         reasons = changes_in_words(updated.changed)
         return False, (

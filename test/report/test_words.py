@@ -88,11 +88,14 @@ def test_a_mistake_is_named_instead_of_a_verdict():
     arm, rng = load_chain('ur10e'), np.random.default_rng(0)
     seen = measure(arm, arm.random_joints(10, rng), rng, 5e-5, 2e-4)
     seen.positions[:] *= 1e3
-    found = judge(Calibration(arm, arm, residual=1e-4), [seen], of_messages=True)
+    calibration = Calibration(arm, arm, residual=1e-4)
+    found = judge(calibration, [seen], of_messages=True)
     told = verdict_in_words(found)
     assert found.verdict == 'no verdict'
     assert told.startswith('no verdict: the positions are in mm')
     assert 'correct the publisher' in told  # not by options of the command line
+    update = Recalibration(calibration, (), 1.0, found.comparison, 1e-4, 1e-4, 0.0)
+    assert still_holds(update, found) == (False, told)  # ~/check said that they agree
 
 
 @pytest.mark.parametrize(('bumped', 'verdict'), [(0.0, 'holds'), (5e-3, 'does not hold')])
