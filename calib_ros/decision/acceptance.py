@@ -153,11 +153,16 @@ def _gain_refusals(
             f'corrected just as well in {100.0 * result.chance:.0f} % of cases '
             f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )
-    elif scaled:
+    elif scaled and not result.surprise:
         printed = all(each.pixels is not None for each in problem.sets)
         yield Reason(Rule.SCALE, out_of_scale(scaled, printed))
     elif result.region is None:
         text = 'the correction is not larger than its own uncertainty, even at the poses measured'
+        if result.surprise:
+            text += (
+                f': the held-out ones are {result.surprise:.1f} times further off than the fitted '
+                'ones lead to expect'
+            )
         if not sized:
             text += (
                 '; measure something that fixes the size and shape of the arm: positions, or two '

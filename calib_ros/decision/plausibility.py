@@ -81,7 +81,7 @@ def add_remarks(problem: Problem, result: Identification, another: bool = True) 
         sigmas = ''
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
     level, other = _level_hand(problem, result), _another_type(problem, result) if another else ''
-    judged = _held_out_excess(problem, result) if another else ''
+    judged = _held_out_excess(result) if another else ''
     loose, order = loose_target(problem.sets), _order(problem)
     found = (other, lens, board, judged, coupled, level, loose, motion, order, sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
@@ -186,33 +186,13 @@ def _motion(problem: Problem, result: Identification) -> str:
     return ''
 
 
-def _held_out_excess(problem: Problem, result: Identification) -> str:
+def _held_out_excess(result: Identification) -> str:
     """Return that held-out positions are further off than noise and expected errors make them."""
-    sets, judged = problem.judging, result.validation
-    if judged is None or judged.repeated is None:
-        return ''
-    if any(each.distances is not None or each.pixels is not None for each in sets):
-        return ''
-    sigmas, found = (problem.sigma_position, problem.sigma_orientation), judged.figures[1].rms_mm
-    squares = result.noise.position**2 * np.concatenate([s.covariances(sigmas) for s in sets])
-    if _rms_mm(squares[judged.deciding]) > NEARER * found:  # noise alone, as nearly always
-        return ''
-    squares += np.concatenate(
-        [result.posterior.expected(each.joints, each.base, each.tool) for each in sets]
+    return bool(result.surprise) * (
+        f'held-out poses are {result.surprise:.1f} times further off than the fitted ones lead to '
+        'expect (stated errors are larger accordingly): are device, target and arm the same, '
+        'unmoved and true to scale?'
     )
-    likely = _rms_mm(squares[judged.deciding])
-    if likely > NEARER * found:
-        return ''
-    return (
-        f'the error of the held-out poses is {found / likely:.1f} times what the fitted ones lead '
-        'to expect: are device, target and arm the same, unmoved and true to scale? Stated errors '
-        'hold for the fitted poses alone'
-    )
-
-
-def _rms_mm(squares: FloatArray) -> float:
-    """Return the RMS length [mm] of positions with expected squares (N, 6, 6) of their errors."""
-    return 1e3 * float(np.sqrt(np.trace(squares[:, :3, :3], axis1=1, axis2=2).mean()))
 
 
 def _order(problem: Problem) -> str:

@@ -76,6 +76,9 @@ class Identification(Shown):
     """What is suspicious despite good figures, and what to do (`plausibility.py`)."""
     coupled: bool
     """Whether unfitted couplings of the wrist explain most of the residuals."""
+    surprise: float
+    """How many times further off held-out positions are than expected, 0 if not clearly; all
+    stated errors are larger accordingly."""
     images: int
     """Number of board images fitted."""
     verdicts: tuple[GroupVerdict, ...] = ()

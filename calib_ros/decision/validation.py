@@ -11,16 +11,17 @@ import numpy as np
 
 from calib_ros.decision.comparison import Comparison, Residuals, compare, joined, residuals
 from calib_ros.estimation.configurations import count_distinct
+from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.identifiability import drawn, independent_in
 from calib_ros.estimation.leastsquares import System, leave_fold_out, minimise
-from calib_ros.estimation.levels import TELLING
+from calib_ros.estimation.levels import NEARER, TELLING
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER, distances_of
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import Flags, Index
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 
 
 def validate(
@@ -187,3 +188,35 @@ def _leave_one_place_out(
     )
     judged = Comparison(first, second, ~fitted.robust.outliers)
     return judged, f'leaving out one of {len(places)} places at a time{judged.omitted}'
+
+
+def held_out_excess(
+    fitted: Fitted, posterior: Posterior, judged: Comparison | None
+) -> tuple[float, float]:
+    """Return by how much held-out positions are further off than noise and expected errors.
+
+    Then follows the factor by which the expected errors are too small (after Birge 1932). They
+    are 0 and 1 unless noise and expected errors are clearly nearer to zero.
+    """
+    problem, sets = fitted.problem, fitted.problem.judging
+    if judged is None or judged.repeated is None:
+        return 0.0, 1.0
+    if any(each.distances is not None or each.pixels is not None for each in sets):
+        return 0.0, 1.0
+    sigmas, found = (problem.sigma_position, problem.sigma_orientation), judged.figures[1].rms_mm
+    squares = [each.covariances(sigmas) for each in sets]
+    noise = fitted.noise.position * _rms_mm(squares, judged.deciding)
+    if noise > NEARER * found:  # noise alone, as nearly always
+        return 0.0, 1.0
+    squares = [posterior.expected(each.joints, each.base, each.tool) for each in sets]
+    expected = _rms_mm(squares, judged.deciding)
+    likely = float(np.hypot(noise, expected))
+    if likely > NEARER * found:
+        return 0.0, 1.0
+    return found / likely, float(np.sqrt(found**2 - noise**2)) / expected
+
+
+def _rms_mm(squares: Sequence[FloatArray], which: Flags) -> float:
+    """Return the RMS length [mm] of positions with expected squares (N, 6, 6) of their errors."""
+    traces = np.trace(np.concatenate(squares)[which, :3, :3], axis1=1, axis2=2)
+    return 1e3 * float(np.sqrt(traces.mean()))

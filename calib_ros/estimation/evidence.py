@@ -104,6 +104,25 @@ class Posterior(Shown):
         model = ErrorModel(self.chain, self.names, base, tool)
         return self.unmodelled.expected(model, self.square, joints)
 
+    def widened(self, factor: float) -> Posterior:
+        """Return it with all expected errors larger by a factor."""
+        count, known = len(self.names), self.unmodelled
+        turns, tilts, waves = (factor * size for size in known.sizes.values())
+
+        def wider(each: MixtureTerm) -> MixtureTerm:
+            weight, mean, covariance = each
+            size = np.append(np.full(count, factor), np.ones(len(mean) - count))  # units of waves
+            return weight, mean * size / factor, covariance * np.outer(size, size)
+
+        return replace(
+            self,
+            covariance=self.covariance + (factor**2 - 1.0) * self.square,
+            device=factor * self.device,
+            mixture=tuple(map(wider, self.mixture)),
+            rival=self.rival and wider(self.rival),
+            unmodelled=known._replace(turns=turns, tilts=tilts, waves=waves),
+        )
+
     def stds_of(self, names: Sequence[str]) -> FloatArray:
         """Return the standard deviations (K,) of undetermined parameters of the arm."""
         groups = [_group(name) for name in names]

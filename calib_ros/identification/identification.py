@@ -26,7 +26,7 @@ from calib_ros.decision.region import Region, region_of
 from calib_ros.decision.result import Identification
 from calib_ros.decision.rounding import may_be_rounding, rounded_joints, rounding_errors
 from calib_ros.decision.steps import find_step
-from calib_ros.decision.validation import validate
+from calib_ros.decision.validation import held_out_excess, validate
 from calib_ros.errors import InputError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import count_distinct
@@ -89,12 +89,11 @@ def _identified(
     share = coupling_share(fitted)
     more, doubts = considered(chain, names, problem.fixed), rounding_errors(problem, coarse)
     inference = Inference(fitted, _size(fitted, share), more, doubts)
-    posterior = inference.judging()
-    unmodelled, moved = unmodelled_errors(posterior, fitted.factor, fitted.system)
-    posterior = inference.with_mixture(replace(posterior, unmodelled=unmodelled))
-    uncertainty = fitted.uncertainty.with_part(moved).with_part(unmodelled.square)
+    posterior, uncertainty = _inferred(inference)
+    surprise, wider = held_out_excess(fitted, posterior, validation)
+    uncertainty = replace(uncertainty, parts=wider**2 * uncertainty.parts)
     parameters = parameter_rows(fitted, uncertainty)
-    region, scaled = _region(inference, posterior)
+    region, scaled = _region(inference, posterior, wider)
     step = find_step(fitted)
     result = Identification(
         chain=chain,
@@ -115,12 +114,13 @@ def _identified(
         converged=before.converged and robust.fit.converged and robust.settled,
         chance=_chance(fitted, before.chain),
         refusals=zero_of_distances(fitted),
-        posterior=posterior,
+        posterior=posterior.widened(wider),
         region=region,
         weak=_weak(problem, parameters),
         step=step,
         remarks=oddities(problem, step, coarse),
         coupled=share > 0.0,
+        surprise=surprise,
         images=sum(count_distinct(s.images) for s in problem.sets if s.pixels is not None),
     )
     own_behaviour = None if step and not step.slow else arms_own(fitted)
@@ -131,17 +131,31 @@ def _identified(
     return plausibility.add_remarks(problem, named, another=named is result)
 
 
-def _region(inference: Inference, posterior: Posterior) -> tuple[Region | None, float]:
-    """Return the region, and the error of the device's scale if that alone leaves none, or 0."""
+def _inferred(inference: Inference) -> tuple[Posterior, identifiability.Uncertainty]:
+    """Return the posterior with what no parameter explains, and the uncertainty of the fit."""
+    fitted, posterior = inference.fitted, inference.judging()
+    unmodelled, moved = unmodelled_errors(posterior, fitted.factor, fitted.system)
+    posterior = inference.with_mixture(replace(posterior, unmodelled=unmodelled))
+    return posterior, fitted.uncertainty.with_part(moved).with_part(unmodelled.square)
+
+
+def _region(
+    inference: Inference, posterior: Posterior, wider: float
+) -> tuple[Region | None, float]:
+    """Return the region, and the error of the device's scale if that alone leaves none, or 0.
+
+    All expected errors are larger by a factor `wider`.
+    """
     fitted, problem = inference.fitted, inference.fitted.problem
     freedom = fitted.uncertainty.overall
     of = partial(region_of, sets=problem.sets, freedom=freedom, largest=problem.largest_error)
-    region = of(posterior)
+    region = of(posterior.widened(wider))
     printed = all(each.pixels is not None for each in problem.sets)
     finer = SCALE if printed else EXCEPTION * SCALE  # as of a tracker
     if region is None and posterior.scale and not 0.0 < problem.sigma_scale <= finer:
         checked = replace(fitted, problem=replace(problem, sigma_scale=finer))
-        if of(replace(inference, fitted=checked).with_mixture(posterior)) is not None:
+        known = replace(inference, fitted=checked).with_mixture(posterior)
+        if of(known.widened(wider)) is not None:
             return None, posterior.scale
     return region, 0.0
 

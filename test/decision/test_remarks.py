@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import UR10E as UR
+from fits import NOISE, SIGMAS, UR10E as UR, measured_arm
 
 from calib_ros.apply.simulation import measure
 from calib_ros.decision import plausibility
@@ -262,3 +262,20 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
     assert list(result.refusals) == refused
     assert [e for e in result.remarks if e != plausibility.COUPLED] == ['first', *remarked]
     assert (plausibility.COUPLED in result.remarks) == ('coupled' in found)
+
+
+@pytest.mark.parametrize(('slip', 'rules'), [(0.0, []), (1e-3, []), (4e-3, [Rule.REGION])])
+def test_held_out_poses_that_contradict_widen_all_errors_stated(slip, rules):
+    """A zero slipped in between: 100 times further off, 8 % better, was valid everywhere."""
+    rng, true, measured = measured_arm(3, 60)
+    unseen = UR.random_joints(40, rng)
+    held = measure(true.with_offsets({'elbow_joint.theta': slip}), unseen, rng, *NOISE)
+    result = identify(Problem(UR, measured, [held], **SIGMAS))
+    assert [each.rule for each in result.refusals] == rules
+    noise, found = 1e3 * np.sqrt(3.0) * NOISE[0], result.validation.figures[1].rms_mm
+    squares = result.pose_covariance(unseen)[:, :3, :3]
+    expected = 1e3 * np.sqrt(np.trace(squares, axis1=1, axis2=2).mean())
+    told = any('held-out' in each for each in result.remarks)
+    assert told == bool(result.surprise) == (slip > 0.0)
+    assert expected == pytest.approx(np.sqrt(found**2 - noise**2), rel=0.02 if slip else np.inf)
+    assert (expected > noise) == (slip > 0.0)
