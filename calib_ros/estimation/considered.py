@@ -40,11 +40,14 @@ def considered(chain: Chain, names: Sequence[str], fixed: Sequence[str] = ()) ->
     """Return the effects that an arm may have besides the named ones.
 
     DH parameters held at nominal by a `fixed` pattern may be off as well, and frames held by the
-    chain file.
+    chain file. Where eccentricity is fitted, waves of other orders look like it in part of a turn.
     """
     every = [name for group in CONSIDERED for name in effects.members(chain, group)]
     every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
     every += travels(chain)
+    fitted = [name for name in effects.members(chain, 'eccentricity') if name in names]
+    for owner in dict.fromkeys(name.owner for name in fitted):
+        every += [wave for order in (3, 4) for wave in effects.waves(owner, order)]
     held = {n for each in fixed for n in fnmatch.filter(chain.parameter_names, each)}
     every += [name for name in chain.parameter_names if name in held and name.of_dh]
     every += [*lenses(chain), *held_frames(chain)]

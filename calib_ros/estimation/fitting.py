@@ -93,7 +93,8 @@ def _fit_all(
     if guarded is not problem:  # outliers carried the information
         problem = guarded
         fitted = fit_from(rough, *_thin_problem(problem, simpler))
-    size, first = _noise_for_priors(fitted.noise, simpler), fitted.size
+    richer = simpler is not None or bool(problem.model.effects)
+    size, first = _noise_for_priors(fitted.noise, richer), fitted.size
     if simpler is None and (fitted.noise.consistent or size <= 1.0):
         size = min(size, _likely_noise(fitted))
     posterior = Inference(fitted, size).likeliest()
@@ -108,7 +109,7 @@ def _fit_all(
         }
         problem = replace(problem, learned=Learned(priors, size))
         fitted = fit_from(fitted.chain, problem, simpler, again=True)
-        less = _noise_for_priors(fitted.noise, simpler)
+        less = _noise_for_priors(fitted.noise, richer)
         if simpler is None or SUSPICIOUS * less > size:
             break
         size = less  # too narrow priors had made it larger
@@ -150,7 +151,7 @@ def _fit(
     return Fitted(problem, structural, start, names, robust, *found)
 
 
-def _noise_for_priors(noise: Noise, simpler: SimplerFit | None) -> float:
+def _noise_for_priors(noise: Noise, richer: bool) -> float:
     """Return the size of the noise [sigma given] that priors are weighed against.
 
     What the geometric model lacks is no noise to it: it can follow a part of it. On measured
@@ -158,10 +159,11 @@ def _noise_for_priors(noise: Noise, simpler: SimplerFit | None) -> float:
     rows of the same session with less. With the noise that neighbours do not share, over FOLLOWED,
     they are those of least squares (`benchmarks/real_robots.py`).
 
-    Of a richer model, priors hold most parameters: the size by their uncertainty may be that of
-    the priors. Residuals tell it if they are as given, or far smaller.
+    Of a richer model, priors hold most parameters, and harmonics named by the user follow errors
+    of other kinds, but only in the session: the size by their uncertainty may be that of the
+    priors. Residuals tell it if they are as given, or far smaller.
     """
-    if simpler is not None:
+    if richer:
         told = max(noise.widened * max(noise.position, noise.orientation or 0.0), 1.0)
         return told if noise.consistent or noise.size > FOLLOWED * told else noise.size
     if noise.consistent:
@@ -218,7 +220,7 @@ def _guarded(
     if problem.learned is not None:
         more = replace(problem.learned, priors={**problem.learned.priors, **guards})
         return replace(problem, learned=more) if guards else problem
-    noise = 1.0 if simpler is None else _noise_for_priors(simpler.noise, None)
+    noise = 1.0 if simpler is None else _noise_for_priors(simpler.noise, richer=False)
     return replace(problem, learned=Learned(guards, noise)) if guards or simpler else problem
 
 

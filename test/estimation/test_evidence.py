@@ -90,6 +90,20 @@ def test_effects_that_an_arm_has_are_considered_with_their_size():
     assert rms(nearer, true, q) < 0.5 * rms(found.chain, true, q)
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_an_arm_with_harmonics_may_have_the_next_ones_too(seed):
+    """In a small region two follow any wave, and all over the range made the arm 8 times worse."""
+    names = [wave for name in UR10E.joint_names for wave in effects.waves(name, 7)]
+    values = np.random.default_rng(seed).normal(scale=3e-4, size=len(names)).tolist()
+    true = arm(seed).with_effects(names).with_effect_values(dict(zip(names, values, strict=True)))
+    near = spread(seed, 0.4)
+    found = identify(problem_of(true, near, seed, effects=('eccentricity',)))
+    q = np.concatenate([near, UR10E.random_joints(1000, np.random.default_rng(1))])
+    q = q[found.region.covers(q)]
+    assert len(q) >= len(near)
+    assert rms(found.chain, true, q) < rms(found.before, true, q)
+
+
 @pytest.mark.parametrize('seed', range(2))
 def test_a_joint_that_moves_in_outliers_only_is_told_by_its_prior(seed):
     """Without them the fit to the rest would be singular, and the noise found nonsense."""

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, arm, measured_arm, rms
+from fits import NOISE, SIGMAS, UR10E, along_path, arm, measured_arm, rms
 
 from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.errors import InputError, TooFewObservationsError
@@ -36,9 +36,10 @@ def noise(size, consistent=False, widened=1.0):
 )
 def test_what_the_model_lacks_weighs_priors_in_part(size, widened, told):
     """What neighbours do not share, over two; never below the sigmas given, or the noise found."""
-    assert fitting._noise_for_priors(noise(size, widened=widened), None) == pytest.approx(told)
-    assert fitting._noise_for_priors(noise(size, True, widened), None) == size
-    assert fitting._noise_for_priors(noise(size, widened=widened), SimpleNamespace()) == size
+    found = fitting._noise_for_priors(noise(size, widened=widened), richer=False)
+    assert found == pytest.approx(told)
+    assert fitting._noise_for_priors(noise(size, True, widened), richer=False) == size
+    assert fitting._noise_for_priors(noise(size, widened=widened), richer=True) == size
 
 
 @pytest.mark.parametrize(
@@ -54,7 +55,7 @@ def test_residuals_tell_the_noise_of_a_richer_model_with_priors_far_above_it(
     position, orientation, consistent, size, told
 ):
     found = Noise(position, orientation, consistent, 0.0, 0.0, (), 1.5, size)
-    assert fitting._noise_for_priors(found, SimpleNamespace()) == pytest.approx(told)
+    assert fitting._noise_for_priors(found, richer=True) == pytest.approx(told)
 
 
 def test_only_what_is_told_worse_than_common_sense_is_guarded():
@@ -185,3 +186,13 @@ def test_effects_larger_than_usual_are_fitted_as_large_as_they_are(seed):
     seen = measure(true, UR10E.random_joints(40, rng), rng, *NOISE)
     found = fitting.fit(Problem(UR10E.with_effects(names), seen, **SIGMAS))
     assert rms(found.chain, true, UR10E.random_joints(200, rng)) < 1.5e-4
+
+
+def test_what_harmonics_named_by_the_user_lack_is_noise_to_them():
+    """Of an arm that bends along a path: taken for a part of it, it made them as large again."""
+    rng, bends = np.random.default_rng(0), members(UR10E, 'gravity')
+    true = arm(rng).with_effects(bends)
+    true = true.with_offsets({name: 1e-3 * rng.normal() for name in bends})
+    seen = measure(true, along_path(60, rng), rng, *NOISE)
+    found = fitting.fit(Problem(UR10E, seen, effects=('eccentricity',), **SIGMAS))
+    assert found.problem.learned.noise > 0.9 * found.noise.size > 1.0
