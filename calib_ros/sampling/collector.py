@@ -18,7 +18,7 @@ import numpy as np
 
 from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.buffers import Rows, Waiting
-from calib_ros.sampling.hints import Hint, apart, ended, restless, sparse
+from calib_ros.sampling.hints import Hint, apart, by_turns, ended, restless, sparse
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.sampler import ROW_WIDTH, TWICE, Found, Numbered, Sampler
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Series, Slice, Stamps, StreamKey
@@ -150,6 +150,8 @@ class Collector:
         shared = self.dropped[f'{JOINTS}: {CONTRARY}']
         found = sparse(between, measurements, self.settings.max_gap, shared)
         needed = self.rests.needed(self.settings.still)
+        if self.rests.swing:
+            return [*found, by_turns(self.rests.swing)]
         if found or needed is None:  # of too rare joint states the noise is not known
             return found
         return [restless(needed, self.settings.still)]
@@ -262,6 +264,8 @@ class Collector:
         self._sort()
         if until <= self._settled_ns:
             return
+        for now in rounds:
+            self.rests.note_swing(self.track.swing_at_rest(ADVANCE_NS, now))
         plan = Schedule(self._settled_ns, self._sampled_ns, self._since_ns)
         if self.settings.mode == 'continuous':
             for end in (*(each - self._late_ns for each in rounds[:-1]), until):

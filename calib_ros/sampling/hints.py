@@ -53,16 +53,20 @@ def restless(needed: float, still: float) -> Hint:
     Beyond the distance of configurations this is no encoder noise: two arms publish.
     """
     if needed > SCATTER:
-        return Hint(
-            'joint values jump back and forth: do two robots publish them?',
-            f'the joint values jump back and forth by {needed:.2g}: do two robots publish the '
-            'same joint names? Give each its own topic, and set joint_topics to the '
-            'one of this robot',
-        )
+        return by_turns(needed)
     return Hint(
         f'joints hardly ever rest within still: set still to {needed:.2g}',
         f'the joints hardly ever rest within still ({still:g}), though the arm is at rest: their '
         f'values are noisy; set still to {needed:.2g}, 6 x their noise',
+    )
+
+
+def by_turns(size: float) -> Hint:
+    """Report joint values that jump back and forth by so much [rad or m]."""
+    return Hint(
+        'joint values jump back and forth: do two robots publish them?',
+        f'the joint values jump back and forth by {size:.2g}: do two robots publish the same '
+        'joint names? Give each its own topic, and set joint_topics to the one of this robot',
     )
 
 

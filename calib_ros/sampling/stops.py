@@ -229,6 +229,8 @@ class Rests:
         self._unseen: list[float] = []
         self._resting = False
         self._jumps = deque[float](maxlen=NO_ACCIDENT)  # noise larger than any at rest
+        self._swings: list[float] = []
+        self.swing = 0.0  # by how much [rad or m] joints at rest jump with each sample
 
     def note(self, noise: float | None) -> None:
         """Note the noise of joints at an undetected rest, None while they move."""
@@ -239,6 +241,13 @@ class Rests:
             self._jumps.append(noise)
         if noise is not None and not before and len(self._unseen) < self._capacity:
             self._unseen.append(noise)
+
+    def note_swing(self, swing: float | None) -> None:
+        """Note by how much joints at rest jump to and fro, None while they move."""
+        if swing is not None and not self.swing:
+            self._swings = [*self._swings, swing] if swing else []
+            if len(self._swings) == NO_ACCIDENT:
+                self.swing = float(np.median(self._swings))
 
     def needed(self, still: float) -> float | None:
         """Return the least `still` that detects most rests; None if it does already."""

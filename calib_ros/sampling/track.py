@@ -15,11 +15,12 @@ import numpy as np
 
 from calib_ros.estimation.levels import TELLING
 from calib_ros.kinematics.se3 import FloatArray, Index
-from calib_ros.sampling.buffers import Rows
+from calib_ros.sampling.buffers import AS_FLOATS, Rows
 from calib_ros.sampling.interpolation import continuous, interpolated, last_moves
 from calib_ros.sampling.intervals import intersection, silences, standing_intervals, union
 from calib_ros.sampling.slices import SILENCE, Series, Stamps
 from calib_ros.sampling.stops import MOST_SPREAD
+from calib_ros.settings import EXCEPTION
 
 APART = 'joint states too far apart'
 CAUSES = ('', 'no joint state before', 'no joint state after', APART)
@@ -173,18 +174,39 @@ class Track:
         Neumann 1941). None with too few samples, or more spread than that: the arm moves.
         """
         largest = None
-        for columns, rows in self._parts.items():
-            end = int(np.searchsorted(rows.stamps, newest_ns, 'right'))
-            first = int(np.searchsorted(rows.stamps, newest_ns - time_ns))
-            values = rows.values[max(0, min(first, end - TELLING)) : end]
+        for values in self._recent(time_ns, newest_ns):
             if len(values) < TELLING:
                 return None
-            values = continuous(values, self._revolute[list(columns)])
             noise = np.sqrt((np.diff(values, 2, axis=0) ** 2).mean(axis=0) / 6.0)
             if (values.std(axis=0) > MOST_SPREAD * noise).any():
                 return None
             largest = max(largest or 0.0, float(noise.max()))
         return largest
+
+    def swing_at_rest(self, time_ns: int, newest_ns: int) -> float | None:
+        """Return by how much [rad or m] joints at rest jump to and fro with each sample, or zero.
+
+        After `sort`; None if they move. The products of second differences with the next one, and
+        the one after it, are -2/3 and 1/6 of their squares for noise, -1 and 1 for two publishers.
+        """
+        if self.noise_at_rest(time_ns, newest_ns) is None:
+            return None
+        largest = AS_FLOATS
+        for values in self._recent(time_ns, newest_ns):
+            left = np.diff(values, 2, axis=0)
+            least = (1.0 - EXCEPTION) * (left**2).mean(axis=0)
+            turned, again = ((left[k:] * left[:-k]).mean(axis=0) for k in (1, 2))
+            sizes = 0.5 * np.sqrt((left**2).mean(axis=0))[(-turned > least) & (again > least)]
+            largest = max(largest, float(sizes.max(initial=0.0)))
+        return largest if largest > AS_FLOATS else 0.0
+
+    def _recent(self, time_ns: int, newest_ns: int) -> Iterator[FloatArray]:
+        """Yield the values of each publisher in some time before a stamp, a few at least."""
+        for columns, rows in self._parts.items():
+            end = int(np.searchsorted(rows.stamps, newest_ns, 'right'))
+            first = int(np.searchsorted(rows.stamps, newest_ns - time_ns))
+            values = rows.values[max(0, min(first, end - TELLING)) : end]
+            yield continuous(values, self._revolute[list(columns)])
 
     def release(self, before_ns: int) -> int:
         """Drop the samples before a stamp, after `sort`; return how many.

@@ -2,10 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
+from sessions import UR5E
+from streams import hear, stamps, stops
 
+from calib_ros import CalibrationSession
 from calib_ros.estimation.configurations import SCATTER
 from calib_ros.sampling.slices import NO_ACCIDENT
 from calib_ros.sampling.stops import SAMPLED, SPIKE, Rests, SampledStops, Schedule, seen_stops
+from calib_ros.sampling.track import Track
 from calib_ros.settings import Settings
 
 S = 10**9
@@ -94,3 +98,33 @@ def test_a_stop_shows_from_its_shortest_time_on_until_it_is_dealt_with():
     assert seen_stops(stands, [15], 20, 4, 4) == [False]
     assert seen_stops(stands, [15], 19, 4, 4) == [True]
     assert seen_stops(np.array([[0, 3]]), [9], 0, 4, 4) == [False]  # too short, now as then
+
+
+@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
+@pytest.mark.parametrize(
+    ('late', 'off', 'told'), [(3e-3, 3e-4, 1), (3e-3, 0.0, 0), (5e-3, 1e-3, 1)]
+)
+def test_two_publishers_of_the_same_joints_by_turns_are_told(mode, late, off, told):
+    """Other values, within `still`, were averaged without a word; 1 mrad was noise to allow."""
+    motion = stops(0.5 * UR5E.random_joints(25, np.random.default_rng(2)))
+    made, times = CalibrationSession(UR5E, Settings(mode=mode)), np.arange(0.0, 49.5, 0.01)
+    both = np.ravel(np.column_stack([times, times + late]))
+    joints = motion(both)
+    joints[1::2] += off
+    poses = UR5E.forward(motion(times))
+    hear(
+        made,
+        (both, stamps(both), joints),
+        (times, stamps(times), *(poses[:, :3, k] for k in (3, np.s_[:3]))),
+    )
+    made.finish()
+    assert sum('two robots publish the same joint names' in each for each in made.warnings) == told
+
+
+def test_noise_at_rest_hardly_ever_jumps_by_turns():
+    rng, found = np.random.default_rng(0), 0
+    for _ in range(500):
+        track = Track([True] * 6, 0.2, 100)
+        track.extend(tuple(range(6)), np.arange(25) * S // 100, 1e-4 * rng.normal(size=(25, 6)))
+        found += bool(track.swing_at_rest(S, 24 * S // 100))
+    assert found < 5
