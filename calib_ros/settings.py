@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Literal, TypeAlias, get_args
 
 from calib_ros.annotated import check_fields
-from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
+from calib_ros.errors import MOST_ENTRIES, ConfigError
 
 Criterion: TypeAlias = Literal['d', 'o2', 'o3', 'o4', 'o5', 'task']
 CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
@@ -18,6 +18,8 @@ Objective: TypeAlias = Literal['mean', 'worst']
 AIMS: tuple[Objective, ...] = get_args(Objective)
 Model: TypeAlias = Literal['corrected', 'nominal']
 MODELS: tuple[Model, ...] = get_args(Model)
+Mode: TypeAlias = Literal['dwell', 'continuous', 'triggered']
+Loss: TypeAlias = Literal['redescending', 'huber', 'none']
 STORAGES = ('mcap', 'sqlite3')
 EXCEPTION = 0.1
 """Share of a whole that is an exception. So many samples fewer, at random, make standard
@@ -28,7 +30,6 @@ LEVER_IN_PART, TURN_IN_PART = 1e-3, 0.02
 theirs; conventions."""
 EXACT = 1e-6  # negligible error [m or rad], invisible to any device
 GROWTH = 2e-5  # default growth of a length [m] per root of a year
-MODES = ('dwell', 'continuous', 'triggered')
 STARTUP = (
     *('max_gap', 'joint_buffer', 'pose_buffer', 'mode', 'lateness', 'delay', 'sources'),
     *('joint_topics', 'joint_names'),
@@ -112,7 +113,7 @@ class Settings:
         200_000, 'joint states kept waiting; when full, the older half is dropped', 2
     )
     pose_buffer: int = _setting(50_000, 'measurements kept waiting, and poses kept, per source', 1)
-    mode: str = _setting(
+    mode: Mode = _setting(
         'dwell',
         'dwell (one pose per stop of the arm), continuous (one per measurement, moving or not) '
         'or triggered (one per call of ~/capture)',
@@ -152,7 +153,7 @@ class Settings:
     largest_error: float = _setting(
         0.01, 'a larger RMS error on held-out poses is not accepted: wrong robot? [m]', 1e-9, 1.0
     )
-    loss: str = _setting('redescending', 'treatment of gross errors: redescending, huber or none')
+    loss: Loss = _setting('redescending', 'treatment of gross errors: redescending, huber or none')
     priors: tuple[str, ...] = _setting(
         (), 'standard deviations about nominal as NAME=SIGMA [m, rad], for example *.a=0.001'
     )
@@ -189,8 +190,6 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.mode not in MODES:
-            raise UnknownNameError('mode', self.mode, MODES)
         for item in fields(self):
             value, lower = getattr(self, item.name), item.metadata['lower']
             if isinstance(item.default, tuple):  # longer lists would take very long

@@ -19,13 +19,12 @@ from calib_ros.estimation.configurations import SCATTER
 from calib_ros.estimation.leastsquares import Prior, System
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.pixels import samples_of
-from calib_ros.estimation.robust import LOSSES
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import DELAY, LENS_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, Index
-from calib_ros.settings import Settings
+from calib_ros.settings import Loss, Settings
 from calib_ros.shown import Shown
 
 NOISE_FIELDS = ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch')
@@ -64,7 +63,7 @@ class Problem(Shown):
     """Largest accepted offsets [m, rad], beyond any fault of the right robot."""
     largest_error: Limit = Settings.largest_error
     """Largest accepted RMS position error [m] on held-out poses."""
-    loss: str = Settings.loss
+    loss: Loss = Settings.loss
     """Treatment of gross errors (`robust.py`): redescending, huber or none."""
     priors: Mapping[str, Positive] = field(default_factory=dict)
     """Standard deviations [m, rad] of parameters about their nominal values, by name or pattern
@@ -93,8 +92,6 @@ class Problem(Shown):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.loss not in LOSSES:
-            raise UnknownNameError('loss', self.loss, LOSSES)
         self._check_sets()
         if not self.free:
             raise ConfigError('every parameter is fixed: nothing is left to identify')

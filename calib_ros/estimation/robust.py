@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from scipy import special
@@ -39,8 +38,6 @@ from calib_ros.kinematics.se3 import (
     norms,
 )
 
-Loss: TypeAlias = Literal['redescending', 'huber', 'none']
-LOSSES: tuple[str, ...] = get_args(Loss)
 OUTLIER = 6.0
 """Distance [scale] beyond which a sample is named as an outlier, at half its weight; a convention
 (Hampel 1974)."""

@@ -8,7 +8,7 @@ from fits import NO_PRIOR, NOISE, UR10E, directions, fitted, measured_arm, rms, 
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import LOSSES, OUTLIER
+from calib_ros.estimation.robust import OUTLIER
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
@@ -119,7 +119,8 @@ def test_starting_values_survive_gross_errors_of_a_metre(unsearched, seed, orien
 def test_clean_data_lose_nothing(oriented, scale):
     """Not even where the sigmas given are too small, so that gross errors are looked for."""
     *_, seen, unseen = cell(int(oriented), oriented)
-    plain, *others = (fit(seen, scale=scale, loss=loss) for loss in sorted(LOSSES, key=len))
+    losses = ('none', 'huber', 'redescending')
+    plain, *others = (fit(seen, scale=scale, loss=loss) for loss in losses)
     assert plain.outliers == ()
     assert len(others) == 2
     for other in others:

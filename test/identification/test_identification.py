@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,11 +14,11 @@ from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Learned, Problem
-from calib_ros.estimation.robust import LOSSES
 from calib_ros.identification.identification import _weak, identify
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.urdf import chain_from_urdf
+from calib_ros.settings import Loss
 
 
 def random_arm(rng, joints):
@@ -118,7 +119,7 @@ def test_problems_that_make_no_sense_are_refused():
     *_, seen = measured_arm(1, 12)
     with pytest.raises(UnknownNameError, match=r'"hubert".*did you mean "huber"') as caught:
         Problem(UR10E, seen, loss='hubert')
-    assert caught.value.alternatives == LOSSES
+    assert caught.value.alternatives == get_args(Loss)
     with pytest.raises(InputError, match='6 joints'):
         Problem(UR10E, Observations.from_arrays(np.zeros((5, 7)), np.zeros((5, 3))))
 

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every measurement that came is in a sample, waits, or is counted with a cause: none is lost."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings, strategies as st
@@ -25,7 +27,7 @@ from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.sampling.account import lost
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import Source
-from calib_ros.settings import MODES, Settings
+from calib_ros.settings import Mode, Settings
 
 POINT = 'geometry_msgs/msg/PointStamped'
 WITH_COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
@@ -80,7 +82,7 @@ def call(session, name):
 
 plans = st.fixed_dictionaries(
     {
-        'mode': st.sampled_from(MODES),
+        'mode': st.sampled_from(get_args(Mode)),
         'lateness': st.sampled_from([0.0, 0.05, 0.4, 1.0]),
         'settle': st.sampled_from([0.0, 0.1]),
         'shortest_stop': st.sampled_from([0.0, 0.2, 1.0]),
