@@ -32,14 +32,7 @@ from calib_ros.errors import CalibrationError
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import (
-    PARALLEL_TOLERANCE,
-    Chain,
-    Convention,
-    Frame,
-    Joint,
-    JointType,
-)
+from calib_ros.kinematics.chain import PARALLEL_TOLERANCE, Chain, Convention, Frame, Joint
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
 from calib_ros.kinematics.effects import group_of
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
@@ -288,10 +281,9 @@ def _csv(chain: Chain) -> str:
 def _read_csv(text: str, form: Chain) -> Chain:
     joints = []
     for row in csv.DictReader(io.StringIO(text.partition('\n')[2], newline='')):
-        kind: JointType = 'prismatic' if row['type'] == 'prismatic' else 'revolute'
-        a, alpha, d, theta, beta = (float(row[name]) for name in DH_KINDS)
-        name, b = from_cell(row['joint']), float(row.get('b', 0.0))
-        joints.append(Joint(name, kind, a, alpha, d, theta, beta, int(row['sign']), b=b))
+        known: dict[str, Any] = {name: float(row[name]) for name in form.columns}
+        known |= {'name': from_cell(row['joint']), 'type': row['type'], 'sign': int(row['sign'])}
+        joints.append(Joint(**known))
     return replace(form, joints=tuple(joints))
 
 
