@@ -13,7 +13,7 @@ from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures
-from calib_ros.files.boards import Board, read_board
+from calib_ros.files.boards import BOARD_KEYS, Board, read_board
 from calib_ros.files.cameras import SUFFIXES, image_files, image_of, read_image
 from calib_ros.files.detector import Image, black_of, detect
 from calib_ros.sampling.pictures import Flaw
@@ -23,8 +23,7 @@ from calib_ros.texts import dump_yaml
 def _board(options: argparse.Namespace, screen: Screen) -> int:
     from calib_ros.report.plots import board_pdf
 
-    keys = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary')
-    content = {key: getattr(options, key) for key in keys}
+    content = {key: getattr(options, key) for key in BOARD_KEYS[:-1]}
     board = Board(**content)
     black = black_of(board)
     if options.out.suffix.lower() != '.pdf':
