@@ -33,7 +33,7 @@ from calib_ros.decision.moved import Step
 from calib_ros.decision.region import Region, packed, region_of_record, rows_of
 from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import find_step
-from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.levels import ALIKE
@@ -54,7 +54,7 @@ from calib_ros.kinematics.chain_file import (
 )
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray, norms
-from calib_ros.settings import MODELS, Model, Settings
+from calib_ros.settings import Model, Settings
 from calib_ros.shown import Shown
 
 HEAD = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
@@ -207,10 +207,9 @@ class Calibration(Shown):
         known = sigma if self.region is None else self.region.known(joints)
         return np.maximum(sigma, np.hypot(known, self.residual or 0.0))
 
+    @as_annotated
     def expected(self, joints: FloatArray, model: Model) -> FloatArray:
         """Return the expected error (N,) [m] of a model at joint values (N, n)."""
-        if model not in MODELS:
-            raise UnknownNameError('model', model, MODELS)
         left = self.remaining(joints)
         if model == 'nominal':
             return np.hypot(np.nan_to_num(left, nan=self.residual or 0.0), self.removed(joints)[0])
