@@ -174,7 +174,7 @@ class Track:
         Neumann 1941). None with too few samples, or more spread than that: the arm moves.
         """
         largest = None
-        for values in self._recent(time_ns, newest_ns):
+        for values in self._paths(time_ns, newest_ns):
             if len(values) < TELLING:
                 return None
             noise = np.sqrt((np.diff(values, 2, axis=0) ** 2).mean(axis=0) / 6.0)
@@ -184,29 +184,31 @@ class Track:
         return largest
 
     def swing_at_rest(self, time_ns: int, newest_ns: int) -> float | None:
-        """Return by how much [rad or m] joints at rest jump to and fro with each sample, or zero.
+        """Return by how much [rad or m] joints jump to and fro with each sample, or zero.
 
-        After `sort`; None if they move. The products of second differences with the next one, and
-        the one after it, are -2/3 and 1/6 of their squares for noise, -1 and 1 for two publishers.
+        After `sort`; None if they do so in motion. The products of second differences with the
+        next one, and the one after it, are -2/3 and 1/6 of their squares for noise, -1 and 1 for
+        two publishers.
         """
+        if not any(_swing(values) for _, values in self._recent(time_ns, newest_ns)):
+            return 0.0
         if self.noise_at_rest(time_ns, newest_ns) is None:
             return None
-        largest = AS_FLOATS
-        for values in self._recent(time_ns, newest_ns):
-            left = np.diff(values, 2, axis=0)
-            least = (1.0 - EXCEPTION) * (left**2).mean(axis=0)
-            turned, again = ((left[k:] * left[:-k]).mean(axis=0) for k in (1, 2))
-            sizes = 0.5 * np.sqrt((left**2).mean(axis=0))[(-turned > least) & (again > least)]
-            largest = max(largest, float(sizes.max(initial=0.0)))
-        return largest if largest > AS_FLOATS else 0.0
+        return max(_swing(values) for values in self._paths(time_ns, newest_ns))
 
-    def _recent(self, time_ns: int, newest_ns: int) -> Iterator[FloatArray]:
-        """Yield the values of each publisher in some time before a stamp, a few at least."""
+    def _paths(self, time_ns: int, newest_ns: int) -> Iterator[FloatArray]:
+        """Yield recent values of each publisher without jumps of a turn."""
+        for columns, values in self._recent(time_ns, newest_ns):
+            yield continuous(values, self._revolute[list(columns)])
+
+    def _recent(
+        self, time_ns: int, newest_ns: int
+    ) -> Iterator[tuple[tuple[int, ...], FloatArray]]:
+        """Yield joints and values of each publisher in some time before a stamp, or a few."""
         for columns, rows in self._parts.items():
             end = int(np.searchsorted(rows.stamps, newest_ns, 'right'))
             first = int(np.searchsorted(rows.stamps, newest_ns - time_ns))
-            values = rows.values[max(0, min(first, end - TELLING)) : end]
-            yield continuous(values, self._revolute[list(columns)])
+            yield columns, rows.values[max(0, min(first, end - TELLING)) : end]
 
     def release(self, before_ns: int) -> int:
         """Drop the samples before a stamp, after `sort`; return how many.
@@ -246,3 +248,16 @@ class Track:
         main = self._parts[self._by_size()[-1]]
         stamps = main.stamps[self.causes(main.stamps) == 0]
         return stamps, self.at(stamps).joints
+
+
+def _swing(values: FloatArray) -> float:
+    """Return by how much a joint of some (M, n) jumps to and fro with each sample, or zero."""
+    if len(values) < TELLING:
+        return 0.0
+    left = np.diff(values, 2, axis=0)
+    squares = np.einsum('mn,mn->n', left, left)
+    least = (1.0 - EXCEPTION) * squares
+    turned = -np.einsum('mn,mn->n', left[1:], left[:-1]) > least
+    again = np.einsum('mn,mn->n', left[2:], left[:-2]) > least
+    largest = squares.max(where=turned & again, initial=0.0)
+    return max(0.5 * float(np.sqrt(largest / len(left))) - AS_FLOATS, 0.0)
