@@ -106,7 +106,7 @@ def _check_shown(
 ) -> None:
     """Require that poses show parameters of frames, also without any one of them.
 
-    Frames that fit all poses exactly tell nothing of the arm.
+    Frames that fit all poses exactly tell nothing. Nominal axes are parallel, nominal hands level.
     """
     groups = numbered(problem.all_sets)
     folds = min(TELLING, count_distinct(np.concatenate(groups)))
@@ -114,7 +114,7 @@ def _check_shown(
     shown = set(excited(triangular_factor(chain, names, system), names)).intersection(
         *(independent(triangular_factor(chain, names, rest), names) for rest in rests)
     )
-    nominal = replace(chain, joints=problem.chain.joints)  # corrected ones are hardly parallel
+    nominal = replace(chain, joints=problem.chain.joints, effects=problem.chain.effects)
     if hidden := set(structurally_independent(nominal, names, problem.kinds)).difference(shown):
         frames = ' and '.join(dict.fromkeys(name.owner for name in names if name in hidden))
         raise InputError(

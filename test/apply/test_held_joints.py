@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from commanded import CELL, missed, regular
 
+from calib_ros import Calibration, Problem, identify, recalibrate
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.program import Program, compensate_program
-from calib_ros.apply.simulation import faulty
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.apply.verification import _match_commands
 from calib_ros.errors import InputError
 from calib_ros.files.programs import program_of, read_joints
@@ -132,3 +133,23 @@ def test_a_command_that_moves_a_locked_joint_is_refused(rng):
     q[0, 2] = 0.31
     (refusal,) = compensate(Compensator(LOCKED, LOCKED), q).refusals
     assert 'the command 0.31 of' in refusal.reason
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('seed', [0, 1])
+def test_heights_of_a_new_device_and_target_of_a_level_hand_are_not_asked_for(seed, oriented):
+    """Couplings fitted to noise keep it not quite level: no number of poses was enough."""
+    rng = np.random.default_rng(seed)
+    true = faulty(PALLETISER, Cell(angle_error=3e-4), rng)
+    true = replace(true, effects=PALLETISER.effects)
+    known = replace(PALLETISER, base=None, tool=replace(true.tool, fixed=False))
+
+    def seen(now, count):
+        q = PALLETISER.random_joints(count, rng)
+        measured = measure(now, q, rng, 5e-5, 1e-4, oriented=oriented)
+        return Problem(known, measured, sigma_position=5e-5, sigma_orientation=1e-4)
+
+    previous = Calibration.of(identify(seen(true, 60)))
+    new = {'base': random_frame(rng, 2.0), 'tool': random_frame(rng, 0.2)}
+    found = recalibrate(previous, seen(replace(true, **new), 12), 0.1, new=(*new,))
+    assert (found.accepted, found.changed) == (True, ())
