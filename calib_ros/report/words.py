@@ -133,7 +133,7 @@ def notes(result: Identification) -> list[str]:
 
 def error_meaning(result: Identification) -> str:
     """Return what errors of distances, planes and corners mean; empty for positions alone."""
-    position = result.fitted.after.position
+    position = (result.validation or result.fitted).after.position
     if (np.abs(position[:, 0]) > SAME)[~position[:, 1:].any(axis=1)].any():
         return (
             'errors of distances and touched planes are along one direction: position errors in '

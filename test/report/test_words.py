@@ -288,7 +288,9 @@ def test_what_computing_leaves_of_poses_without_noise_is_no_distance():
     position = 1e-16 * np.ones((40, 3))
     position[0, 1:] = 0.0
     after = replace(result.fitted.after, position=position)
-    of_poses = replace(result, fitted=replace(result.fitted, after=after))
+    fitted = replace(result.fitted, after=after)
+    of_poses = replace(result, fitted=fitted, validation=None)
     assert words.error_meaning(of_poses) == ''
     position[0, 0] = 1e-4
     assert 'errors of distances' in words.error_meaning(of_poses)
+    assert words.error_meaning(replace(of_poses, validation=result.fitted)) == ''  # by poses
