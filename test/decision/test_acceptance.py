@@ -212,10 +212,9 @@ def test_a_chain_that_lists_the_wrong_axes_as_parallel_is_named(parallel, words)
     assert all(any(each in text for text in said) for each in words)
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_rows_in_another_order_do_not_look_like_the_wrong_arm(seed):
+def test_rows_in_another_order_do_not_look_like_the_wrong_arm():
     """Whatever the parameters, the fit explains nothing: that comes first."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     seen = measure(faulty(UR10E, Cell(), rng), UR10E.random_joints(60, rng), rng, 5e-5, 2e-4)
     result = identify(Problem(UR10E, replace(seen, joints=rng.permutation(seen.joints))))
     rules = [each.rule for each in result.refusals]
