@@ -13,7 +13,7 @@ from rclpy.node import Node
 from calib_ros.files.archive import Archive
 from calib_ros.ros.boundary import Boundary
 from calib_ros.ros.inputs import Inputs
-from calib_ros.sampling.account import Account
+from calib_ros.sampling.account import Account, Cause
 from calib_ros.sampling.session import CalibrationSession
 
 
@@ -31,7 +31,7 @@ class Diagnostics:
     ) -> None:
         self._node, self._session, self._archive = node, session, archive
         self._inputs, self._boundary, self._serial = inputs, boundary, serial
-        self._dropped_before: dict[str, int] = {}
+        self._dropped_before: dict[Cause, int] = {}
         self.unloaded = ''  # why no calibration was loaded at the start, if one was wanted
         self._alike = 1
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)

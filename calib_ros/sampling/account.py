@@ -4,16 +4,38 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.sampling.slices import JOINTS, POSES
 
 LOST = 'were dropped (stamps or full buffers)'
 ALLOW = 'accept the rest with largest_loss (--largest-loss)'
-_LOSS = re.compile('(?!.*(same stamp twice|: in frame ")).*(stamp|lateness|buffer full|memory)')
+
+
+class Lost(str):
+    """Why messages are lost: their stamp or a full buffer, not what the device did not see."""
+
+    __slots__ = ()
+
+
+class Cause(str):
+    """Why messages of a `kind` were dropped, for a reader; `why` without the kind."""
+
+    __slots__ = ('kind', 'why')
+    kind: str
+    why: str
+
+    def __new__(cls, kind: str, why: str) -> Cause:
+        """Return the text with its parts."""
+        cause = super().__new__(cls, f'{kind}: {why}')
+        cause.kind, cause.why = kind, why
+        return cause
+
+    def __getnewargs__(self) -> tuple[str, str]:  # type: ignore[override]
+        return self.kind, self.why
 
 
 @dataclass(frozen=True)
@@ -27,7 +49,7 @@ class Account:
     held_out: int
     configurations: int
     unused: dict[str, int]
-    dropped: dict[str, int]
+    dropped: dict[Cause, int]
     notes: dict[str, int]
     foreign_names: tuple[str, ...]
     never_named: tuple[str, ...]
@@ -41,8 +63,8 @@ class Account:
             text += f', {self.configurations} of them different'
         if self.waiting:
             text += f', {self.waiting} measurements waiting'
-        tables = {'not used': self.unused, 'dropped': self.dropped, 'note': self.notes}
-        for label, counts in tables.items():
+        tables: tuple[Mapping[Any, int], ...] = (self.unused, self.dropped, self.notes)
+        for label, counts in zip(('not used', 'dropped', 'note'), tables, strict=True):
             if counts:
                 parts = ', '.join(f'{count} x {cause}' for cause, count in counts.items())
                 text += f'; {label}: {parts}'
@@ -55,15 +77,11 @@ class Account:
         return text
 
 
-def lost(kind: str, total: int, dropped: Mapping[str, int]) -> tuple[float, str]:
-    """Return the share of messages of a kind that was lost, and the main cause.
-
-    Lost messages were dropped for their stamp or a full buffer; duplicates, and what the device
-    did not see, do not count.
-    """
-    causes = {c: n for c, n in dropped.items() if c.startswith(kind) and _LOSS.match(c)}
+def lost(kind: str, total: int, dropped: Mapping[Cause, int]) -> tuple[float, str]:
+    """Return the share of messages of a kind that was lost, and the main cause."""
+    causes = {c.why: n for c, n in dropped.items() if c.kind == kind and isinstance(c.why, Lost)}
     most = max(causes, key=causes.__getitem__, default='')
-    return sum(causes.values()) / total if total else 0.0, most.removeprefix(f'{kind}: ')
+    return sum(causes.values()) / total if total else 0.0, most
 
 
 def too_much_lost(account: Account, largest_loss: float) -> list[Reason]:

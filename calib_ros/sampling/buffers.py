@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.slices import NO_ACCIDENT, Stamps, StreamKey
+from calib_ros.sampling.account import Cause, Lost
+from calib_ros.sampling.slices import NO_ACCIDENT, POSES, Stamps, StreamKey
 from calib_ros.values import MOST_NAMES
 
 AS_FLOATS = 8.0 * float(np.finfo(np.float32).eps)
@@ -80,8 +81,9 @@ class Rows:
         return int(near.sum()), int((~near).sum())
 
 
-TOO_LATE = 'measurements: later than lateness allows'
-TOO_MANY = f'measurements: beyond {MOST_NAMES} targets or frames'
+TOO_LATE = Lost('later than lateness allows')
+FULL = Cause(POSES, Lost('pose buffer full'))
+TOO_MANY = Cause(POSES, f'beyond {MOST_NAMES} targets or frames')
 
 
 class ClockOffset:
@@ -127,7 +129,7 @@ class Waiting(dict[StreamKey, Rows]):
     """
 
     def __init__(
-        self, width: int, capacity: int, dropped: Counter[str], kept: Callable[[StreamKey], bool]
+        self, width: int, capacity: int, dropped: Counter[Cause], kept: Callable[[StreamKey], bool]
     ) -> None:
         self._width, self._capacity = width, capacity
         self._dropped, self._kept = dropped, kept
@@ -162,8 +164,8 @@ class Waiting(dict[StreamKey, Rows]):
         due = np.flatnonzero(stamps > after_ns)
         taken = due[: rows.capacity - rows.count]
         if len(due) < len(stamps):
-            self._dropped[TOO_LATE] += len(stamps) - len(due)
+            self._dropped[Cause(POSES, TOO_LATE)] += len(stamps) - len(due)
         if len(taken) < len(due):
-            self._dropped['measurements: pose buffer full'] += len(due) - len(taken)
+            self._dropped[FULL] += len(due) - len(taken)
         rows.extend(stamps[taken], numbers[taken])
         return True

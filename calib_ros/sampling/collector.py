@@ -17,7 +17,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from calib_ros.kinematics.se3 import Index
-from calib_ros.sampling.buffers import Rows, Waiting
+from calib_ros.sampling.account import Cause, Lost
+from calib_ros.sampling.buffers import TOO_LATE, Rows, Waiting
 from calib_ros.sampling.hints import Hint, apart, by_turns, ended, restless, sparse
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.sampler import ROW_WIDTH, TWICE, Found, Numbered, Sampler
@@ -28,7 +29,7 @@ from calib_ros.settings import Settings
 from calib_ros.values import MOST_NAMES
 
 REST_S = 0.5 * Settings.shortest_stop  # time [s] without motion after which joints stand
-CONTRARY = 'different values with the same stamp (two publishers, or stamps too coarse?)'
+CONTRARY = Lost('different values with the same stamp (two publishers, or stamps too coarse?)')
 ADVANCE_NS = round(5e9 * REST_S)  # time between two rounds of sampling, by joint stamps
 
 
@@ -125,7 +126,7 @@ class Collector:
             if newest < self.track.horizon_ns:
                 self._backwards += 1
                 if self._backwards < NO_ACCIDENT:
-                    self.dropped['joints: later than lateness allows'] += 1
+                    self.dropped[Cause(JOINTS, TOO_LATE)] += 1
                     return
                 self.start_anew()
             self._backwards = 0
@@ -146,8 +147,8 @@ class Collector:
 
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the joint states, given the number of measurements."""
-        between = self.dropped[f'measurements: {APART}']
-        shared = self.dropped[f'{JOINTS}: {CONTRARY}']
+        between = self.dropped[Cause(POSES, APART)]
+        shared = self.dropped[Cause(JOINTS, CONTRARY)]
         found = sparse(between, measurements, self.settings.max_gap, shared)
         needed = self.rests.needed(self.settings.still)
         if self.rests.swing:
@@ -286,7 +287,7 @@ class Collector:
             if numbered:  # image numbers always differ
                 equal, contrary = equal + contrary, 0
             self.unused += Counter({f'{kind}: {TWICE}': equal})
-            self.dropped += Counter({f'{kind}: {CONTRARY}': contrary})
+            self.dropped += Counter({Cause(kind, CONTRARY): contrary})
 
     def _plan_stops(
         self, plan: Schedule, until: int, rounds: Sequence[int], ends_here: bool
@@ -362,7 +363,7 @@ class Collector:
 
     def _count_causes(self, cause: Index) -> None:
         for k, count in sorted(Counter(cause[cause > 0].tolist()).items()):
-            self.dropped[f'measurements: {CAUSES[k]}'] += count
+            self.dropped[Cause(POSES, CAUSES[k])] += count
 
     def start_anew(self) -> None:
         """Continue after the clock jumped back: finish earlier messages, keep the samples."""

@@ -9,9 +9,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from calib_ros.sampling.account import Cause, Lost
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Slice, StreamKey
 
-STRAY = 'stamp far from those before and after (do the clocks of all publishers agree?)'
+STRAY = Lost('stamp far from those before and after (do the clocks of all publishers agree?)')
 
 
 class Gate:
@@ -26,7 +27,7 @@ class Gate:
         self._far_ns = round(far * 1e9)
         self._last: dict[str, int] = {}
         self._held: list[tuple[str, int, Slice]] = []
-        self.dropped: Counter[str] = Counter()  # messages with stray stamps
+        self.dropped: Counter[Cause] = Counter()  # messages with stray stamps
 
     def held(self, kind: str) -> int:
         """Return the number of held messages of a kind."""
@@ -91,7 +92,7 @@ class Gate:
             found = [*self._now_near(), given]
             self._last[kind] = time_ns
             if strays := self.held(kind):
-                self.dropped[f'{kind}: {STRAY}'] += strays
+                self.dropped[Cause(kind, STRAY)] += strays
                 self._held = [each for each in self._held if each[0] != kind]
             return found, False
         self._held.append((kind, time_ns, given))

@@ -14,7 +14,7 @@ from calib_ros.estimation.configurations import SCATTER, configurations, count_d
 from calib_ros.estimation.levels import FEW, NEARER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.account import LOST, lost
+from calib_ros.sampling.account import LOST, Cause, lost
 from calib_ros.sampling.dataset import lenses_by_frame
 from calib_ros.sampling.live import START, Estimate, barely_moved
 from calib_ros.sampling.sample import Sample, named
@@ -190,7 +190,7 @@ def of_two_places(spreads: Sequence[float], usual: float) -> list[Hint]:
     return [Hint(words, f'{words} {remedy}')]
 
 
-def losses(received: Mapping[str, int], dropped: Mapping[str, int]) -> list[Hint]:
+def losses(received: Mapping[str, int], dropped: Mapping[Cause, int]) -> list[Hint]:
     """Report a large share of lost messages, and the main cause."""
     found = []
     for kind in (JOINTS, POSES):

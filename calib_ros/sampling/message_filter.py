@@ -11,6 +11,7 @@ import numpy as np
 
 from calib_ros.estimation.configurations import STILL
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
+from calib_ros.sampling.account import Cause, Lost
 from calib_ros.sampling.hints import Hint
 from calib_ros.sampling.slices import (
     JOINTS,
@@ -28,7 +29,7 @@ from calib_ros.values import LARGEST, MOST_NAMES, ROUNDED, covariance_faults
 OTHERS = 'none of the joints in the message'
 NO_VALUES = 'no positions in the message'
 UNEVEN = 'names and positions differ in number'
-NO_STAMP = 'zero stamp (fill header.stamp where it is published)'
+NO_STAMP = Lost('zero stamp (fill header.stamp where it is published)')
 NOT_UNIT = 'quaternion not of length 1 (normalise it where it is published)'
 NOWHERE = -1  # column of a joint that needs no name
 
@@ -230,7 +231,7 @@ class MessageFilter:
     def __init__(self, names: JointNames, frames: FrameNames, joint_count: int) -> None:
         self._names, self._frames, self._joint_count = names, frames, joint_count
         self.received: Counter[str] = Counter()
-        self.dropped: Counter[str] = Counter()
+        self.dropped: Counter[Cause] = Counter()
         self.unused: Counter[str] = Counter()
         self.refused: dict[str, str] = {}  # why the last messages of a kind cannot be used
         self.latest: tuple[int, Sequence[float]] | None = None
@@ -245,7 +246,7 @@ class MessageFilter:
     def miss(self, kind: str, count: int, cause: str) -> None:
         """Count received messages that cannot be used."""
         self.received[kind] += count
-        self.dropped[f'{kind}: {cause}'] += count
+        self.dropped[Cause(kind, cause)] += count
         self.refused[kind] = cause
 
     def _usable(self, part: Part) -> Part:
@@ -301,7 +302,7 @@ class MessageFilter:
             if not recording:
                 self.unused['measurements: not recording'] += count
             elif fault := self._frames.fault(source.device, frame_id, count):
-                self.dropped[f'{POSES}: {fault}'] += count
+                self.dropped[Cause(POSES, fault)] += count
                 self.refused[POSES] = fault
             else:
                 width = numbers.shape[1]

@@ -22,7 +22,9 @@ from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.resection import board_poses, uncertainty
 from calib_ros.kinematics import se3
+from calib_ros.sampling.account import Cause, Lost
 from calib_ros.sampling.sample import Sample, View
+from calib_ros.sampling.slices import POSES
 from calib_ros.texts import LARGEST_TABLE
 
 MOST_BYTES = 5 * LARGEST_TABLE
@@ -71,7 +73,7 @@ class Pictures:
         """Forget all images and counts."""
         self._kept: dict[int, tuple[str, int, Callable[[], Any]]] = {}
         self._queue: deque[tuple[Sample, Future[Sample | Flaw]]] = deque()
-        self.dropped: Counter[str] = Counter()  # unused images by cause
+        self.dropped: Counter[Cause] = Counter()  # unused images by cause
         self.refused = ''  # why the last image is not used; empty if it is
         self.reason = ''  # why the last of those dropped is not used
 
@@ -103,7 +105,8 @@ class Pictures:
                 self.refused = ''
             if isinstance(result, Flaw):
                 self.refused = self.reason = result.reason
-                self.dropped[f'measurements: image {result.cause}'] += sample.count
+                why = (Lost if result is FORGOTTEN else str)(f'image {result.cause}')
+                self.dropped[Cause(POSES, why)] += sample.count
             else:
                 found.append(result)
         return found

@@ -15,9 +15,10 @@ import numpy as np
 from calib_ros.estimation.configurations import STILL
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
+from calib_ros.sampling.account import Cause, Lost
 from calib_ros.sampling.interpolation import unwrapped
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import Stamps, StreamKey
+from calib_ros.sampling.slices import POSES, Stamps, StreamKey
 from calib_ros.sampling.stops import averages, mean_of_each
 from calib_ros.sampling.track import Motion
 
@@ -25,8 +26,8 @@ DISTANCE_SLICE, POSITION_SLICE = slice(0, 1), slice(0, 3)
 QUAT_SLICE, COVARIANCE_SLICE = slice(3, 7), slice(7, 43)
 ROW_WIDTH = COVARIANCE_SLICE.stop
 Numbered: TypeAlias = tuple[int, Sample]  # A sample with the number of its round or stop
-VIBRATING = 'measurements: still vibrating, or a spike'
-RESTLESS = 'measurements: a stop with more spread than noise'
+VIBRATING = Cause(POSES, 'still vibrating, or a spike')
+RESTLESS = Cause(POSES, 'a stop with more spread than noise')
 TWICE = 'same stamp twice'
 
 
@@ -51,7 +52,7 @@ class Sampler:
         self.fresh: list[Sample] = []  # samples not taken yet
         self._calm: int | None = None  # fresh samples before the first stop not at rest
         self._shaken = math.inf  # the number of that stop
-        self.dropped: Counter[str] = Counter()
+        self.dropped: Counter[Cause] = Counter()
         self.rested = self.restless = 0  # stops with measurements at rest, and not
         self.doubled: list[float] = []  # spreads [m] of those in two places by turns
 
@@ -180,8 +181,8 @@ class Sampler:
         free = self._free(key, stamp_ns, joints)
         known = self._taken[key]
         if free is None or len(known) >= self._capacity:
-            why = TWICE if free is None else 'the memory for poses is full'
-            self.dropped[f'measurements: {why}'] += len(rows)
+            why = TWICE if free is None else Lost('the memory for poses is full')
+            self.dropped[Cause(POSES, why)] += len(rows)
             return
         known[free] = joints
         covariance = None

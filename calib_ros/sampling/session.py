@@ -19,7 +19,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify_model
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
-from calib_ros.sampling.account import Account
+from calib_ros.sampling.account import Account, Cause
 from calib_ros.sampling.dataset import Dataset, check_settings, collect, dataset_of
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.hints import Hint, frozen, losses, progress, spoilt, unheard, unseen
@@ -227,7 +227,7 @@ class CalibrationSession:
         )
 
     @property
-    def _dropped(self) -> Counter[str]:
+    def _dropped(self) -> Counter[Cause]:
         gate, images = self._pipeline.gate.dropped, self.pictures.dropped
         return self._filter.dropped + self._collector.dropped + images + gate
 

@@ -21,6 +21,7 @@ import numpy as np
 from calib_ros.errors import MOST_ENTRIES
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.account import Lost
 from calib_ros.sampling.cdr import Layouts
 from calib_ros.sampling.message_filter import usable
 from calib_ros.sampling.messages import TRANSFORMS, short_type
@@ -33,6 +34,7 @@ from calib_ros.values import SAME
 Pair: TypeAlias = tuple[str, ...]  # parent and child frame of a link
 
 STATIC = '_static'  # suffix of the topic of static links
+UNLINKED = Lost('buffer full before their frames were linked')
 
 
 class Route(NamedTuple):
@@ -112,7 +114,7 @@ class Links:
             found += [self._measured(s, route, read) for s, route in measured]
         if not is_open:
             lost_count = sum(n * len(self._routes_of(link)) for link, n in self._let_go.items())
-            faults += Counter({'buffer full before their frames were linked': lost_count})
+            faults += Counter({UNLINKED: lost_count})
             self._let_go.clear()
             self._held.clear()
         while sum(len(waiting.places) for waiting in self._held) > Settings.pose_buffer:
