@@ -80,15 +80,18 @@ class ColumnsError(InputError):
 
 
 class TooFewObservationsError(InputError):
-    """Too few matched pairs for the requested parameters."""
+    """Too few matched pairs for the requested parameters; `account` says what was received."""
 
-    def __init__(self, configurations: int, needed: int, why: str) -> None:
-        self.configurations = configurations
-        self.needed = needed
+    def __init__(self, configurations: int, needed: int, why: str, account: str = '') -> None:
+        self.configurations, self.needed, self.why = configurations, needed, why
         super().__init__(
             f'too few different poses: {configurations} measured, at least {needed} needed '
-            f'({why}); measure 30 or more, or hold parameters (fixed)'
+            f'({why}){account and f" ({account})"}; measure 30 or more, or hold parameters (fixed)'
         )
+
+    def after(self, account: str) -> TooFewObservationsError:
+        """Return the error with what was received."""
+        return TooFewObservationsError(self.configurations, self.needed, self.why, account)
 
 
 def near(name: str, alternatives: Iterable[str], least: float = 0.5) -> str:

@@ -24,7 +24,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.dataset import Dataset
 from calib_ros.sampling.sample import named
-from calib_ros.sampling.session import CalibrationSession, too_few
+from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
 MEASURED = (Rule.MISTAKE, Rule.LARGEST_ERROR, Rule.CONVERGENCE, Rule.SCALE)
@@ -61,7 +61,7 @@ class Loaded:
             result = identify_model(self.problem, model, progress)
         except TooFewObservationsError as err:
             if self.read:
-                raise too_few(err, '; '.join((self.read, *self.warnings))) from err
+                raise err.after('; '.join((self.read, *self.warnings))) from err
             raise
         own = [e for e in result.refusals if not self.instead or e.rule in MEASURED]
         return replace(result, refusals=(*own, *self.refusals))

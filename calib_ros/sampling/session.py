@@ -329,7 +329,7 @@ class CalibrationSession:
         try:
             result = identify_model(problem, self.settings.model)
         except TooFewObservationsError as err:
-            raise too_few(err, self.summary) from err
+            raise err.after(self.summary) from err
         if result.accepted:
             owners = named(self.samples).owners
             self.adopt(Calibration.of(result, owners=owners, fitted=problem.sets), self.samples)
@@ -384,9 +384,3 @@ class CalibrationSession:
         for sample in fresh:
             self.on_sample(sample)
         return len(self.samples)
-
-
-def too_few(err: TooFewObservationsError, summary: str) -> InputError:
-    """Return an error of too few samples with the account of messages `summary`."""
-    few, _, advice = str(err).rpartition('; ')
-    return InputError(f'{few} ({summary}); {advice}')

@@ -28,7 +28,6 @@ from calib_ros.ros.inputs import deserialised
 from calib_ros.sampling.batches import Stream, feed
 from calib_ros.sampling.hints import apart
 from calib_ros.sampling.messages import JOINT_STATE
-from calib_ros.sampling.session import too_few
 from calib_ros.sampling.sources import STANDARD
 from calib_ros.shown import moment
 
@@ -113,7 +112,7 @@ def test_what_made_poses_too_few_is_in_the_answer_though_the_error_is_cut(cell, 
     identifying, hint = cell.node._identifying, apart(-3.0).text
     identifying._journal = tmp_path / 'ur10e_20260102T030405000006Z.csv'
     counts = f'2500 joint states{", dropped" * 30}; {hint}'
-    text = str(too_few(TooFewObservationsError(2, 5, '6 equations each'), counts))
+    text = str(TooFewObservationsError(2, 5, '6 equations each', counts))
     assert hint not in text
     identifying._advice = hint
     first, advice, _ = identifying.shortened((False, text))[1].split(' ... ')
