@@ -34,6 +34,7 @@ class Advice:
     refusal: str = ''  # the sentence of its rule
     again: str = AGAIN  # what to identify next
     in_short: str = ''  # the heading, with the mistake if there is one
+    sound: bool = False  # whether the arm shows no errors
 
 
 ENOUGH = 25  # poses worth judging, and the default of `calib_ros plan`: a convention
@@ -64,6 +65,7 @@ GOOD_ARM = Advice(
     'The error is within the stated noise of the measuring device: the arm is as good as this '
     'device can see.',
     ('To look for smaller errors, measure with a more accurate device.',),
+    sound=True,
 )
 """Instead of `Rule.GAIN`, if the error before is within the noise."""
 GOOD_HERE = replace(

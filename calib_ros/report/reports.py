@@ -59,8 +59,8 @@ def identification_report(
     poses = poses or poses_of(problem, result, loaded.by_line, loaded.images)
     reasons = advice_of(result)
     text = filter(None, _text(result, reasons, tolerance))
-    gain = sections.gain(judged)
-    gain = gain if result.accepted else gain.split(' → ')[0] * _sound(reasons)
+    shown = 2 if result.accepted else int(_sound(reasons))
+    gain = sections.gain(judged, count=shown) if shown else ''
     fitted = [counted(result.rank, 'parameter')]
     fitted += words.notes(result)[:1] if result.chain.effects else []
     scale = f'scale checked to {1e6 * problem.sigma_scale:g} ppm'
@@ -155,7 +155,7 @@ def doubts(result: Identification) -> tuple[str, ...]:
 
 def _sound(reasons: Sequence[Advice]) -> bool:
     """Tell whether a result is refused because the arm shows no errors."""
-    return any(each.heading == GOOD_ARM.heading for each in reasons)
+    return any(each.sound for each in reasons)
 
 
 def _within(judged: Comparison, tolerance: float | None, when: int = 1) -> str:

@@ -36,10 +36,10 @@ LABELS = (
 """Rows of the accuracy table below head and count."""
 
 
-def gain(which: Comparison, intervals: bool = True) -> str:
-    """Return the errors before and after, with their uncertainty if wanted."""
+def gain(which: Comparison, intervals: bool = True, count: int = 2) -> str:
+    """Return the errors before and after, or one, with their uncertainty if wanted."""
     parts = []
-    for when, found in enumerate(which.figures):
+    for when, found in enumerate(which.figures[:count]):
         between = words.rms_range_mm(which, when) if intervals else ''
         parts.append(f'{rounded(found.rms_mm)} mm' + (f' ({between})' if between else ''))
     return f'RMS position error: {" → ".join(parts)}'
