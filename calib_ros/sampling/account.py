@@ -18,13 +18,10 @@ ALLOW = 'accept the rest with largest_loss (--largest-loss)'
 class Lost(str):
     """Why messages are lost: their stamp or a full buffer, not what the device did not see."""
 
-    __slots__ = ()
-
 
 class Cause(str):
     """Why messages of a `kind` were dropped, for a reader; `why` without the kind."""
 
-    __slots__ = ('kind', 'why')
     kind: str
     why: str
 

@@ -82,7 +82,6 @@ class Rows:
 
 
 TOO_LATE = Lost('later than lateness allows')
-FULL = Cause(POSES, Lost('pose buffer full'))
 TOO_MANY = Cause(POSES, f'beyond {MOST_NAMES} targets or frames')
 
 
@@ -166,6 +165,6 @@ class Waiting(dict[StreamKey, Rows]):
         if len(due) < len(stamps):
             self._dropped[Cause(POSES, TOO_LATE)] += len(stamps) - len(due)
         if len(taken) < len(due):
-            self._dropped[FULL] += len(due) - len(taken)
+            self._dropped[Cause(POSES, Lost('pose buffer full'))] += len(due) - len(taken)
         rows.extend(stamps[taken], numbers[taken])
         return True

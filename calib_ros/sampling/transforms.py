@@ -34,7 +34,6 @@ from calib_ros.values import SAME
 Pair: TypeAlias = tuple[str, ...]  # parent and child frame of a link
 
 STATIC = '_static'  # suffix of the topic of static links
-UNLINKED = Lost('buffer full before their frames were linked')
 
 
 class Route(NamedTuple):
@@ -114,7 +113,7 @@ class Links:
             found += [self._measured(s, route, read) for s, route in measured]
         if not is_open:
             lost_count = sum(n * len(self._routes_of(link)) for link, n in self._let_go.items())
-            faults += Counter({UNLINKED: lost_count})
+            faults += Counter({Lost('buffer full before their frames were linked'): lost_count})
             self._let_go.clear()
             self._held.clear()
         while sum(len(waiting.places) for waiting in self._held) > Settings.pose_buffer:
