@@ -83,17 +83,13 @@ def lost(kind: str, total: int, dropped: Mapping[Cause, int]) -> tuple[float, st
 
 def too_much_lost(account: Account, largest_loss: float) -> list[Reason]:
     """Return why a result must not be accepted: more than `largest_loss` of a kind was lost."""
-    counts = ((JOINTS, account.joint_states), (POSES, account.poses))
-    found = [(name, *lost(name, count, account.dropped)) for name, count in counts]
-    return [
-        Reason(
-            Rule.DROPPED,
-            f'{100.0 * share:.0f} % of the {name} {LOST}; {allowing(share)}, or remove the cause: '
-            f'{cause}',
-        )
-        for name, share, cause in found
-        if share > largest_loss
-    ]
+    found = []
+    for kind, count in ((JOINTS, account.joint_states), (POSES, account.poses)):
+        share, cause = lost(kind, count, account.dropped)
+        if share > largest_loss:
+            text = f'{100.0 * share:.0f} % of the {kind} {LOST}; {allowing(share)}, or remove the '
+            found.append(Reason(Rule.DROPPED, f'{text}cause: {cause}'))
+    return found
 
 
 def allowing(share: float) -> str:

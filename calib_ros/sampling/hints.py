@@ -194,9 +194,8 @@ def losses(received: Mapping[str, int], dropped: Mapping[Cause, int]) -> list[Hi
     """Report a large share of lost messages, and the main cause."""
     found = []
     for kind in (JOINTS, POSES):
-        total = received[kind]
-        share, cause = lost(kind, total, dropped)
-        if share > EXCEPTION and share * total >= NO_ACCIDENT:
+        share, cause = lost(kind, received[kind], dropped)
+        if share > EXCEPTION and share * received[kind] >= NO_ACCIDENT:
             words = f'{100.0 * share:.0f} % of the {kind} {LOST}: {cause}'
             found.append(Hint(f'{100.0 * share:.0f} % of the {kind} are dropped: {cause}', words))
     return found
