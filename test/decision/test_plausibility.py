@@ -356,8 +356,8 @@ def test_held_out_poses_that_the_fit_does_not_let_expect_are_told(ppm, told):
     """By another tracker they were 0.6 mm off, and 0.05 mm was stated."""
     fitted, others = seen_of(arm(0)), seen_of(arm(0), seed=1, count=20)
     problem = Problem(UR, fitted, held_out=scaled(others, ppm), **SIGMAS)
-    said = [each for each in identify(problem).remarks if 'times what' in each]
+    said = [each for each in identify(problem).remarks if 'times further' in each]
     assert len(said) == told
-    assert all(re.search('poses is (4|5|6|7|8|9)', each) for each in said)
+    assert all(re.search('poses are (4|5|6|7|8|9)', each) for each in said)
     bare = replace(problem, held_out=None)
-    assert not any('times what' in each for each in identify(bare).remarks)
+    assert not any('times further' in each for each in identify(bare).remarks)
