@@ -265,8 +265,7 @@ class Collector:
         self._sort()
         if until <= self._settled_ns:
             return
-        for now in rounds:
-            self.rests.note_swing(self.track.swing_at_rest(ADVANCE_NS, now))
+        self.rests.note_swings(self.track.swings_at_rest(ADVANCE_NS, rounds))
         plan = Schedule(self._settled_ns, self._sampled_ns, self._since_ns)
         if self.settings.mode == 'continuous':
             for end in (*(each - self._late_ns for each in rounds[:-1]), until):

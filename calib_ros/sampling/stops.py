@@ -242,12 +242,13 @@ class Rests:
         if noise is not None and not before and len(self._unseen) < self._capacity:
             self._unseen.append(noise)
 
-    def note_swing(self, swing: float | None) -> None:
+    def note_swings(self, swings: Sequence[float | None]) -> None:
         """Note by how much joints at rest jump to and fro, None while they move."""
-        if swing is not None and not self.swing:
-            self._swings = [*self._swings, swing] if swing else []
-            if len(self._swings) == NO_ACCIDENT:
-                self.swing = float(np.median(self._swings))
+        for swing in swings:
+            if swing is not None and not self.swing:
+                self._swings = [*self._swings, swing] if swing else []
+                if len(self._swings) == NO_ACCIDENT:
+                    self.swing = float(np.median(self._swings))
 
     def needed(self, still: float) -> float | None:
         """Return the least `still` that detects most rests; None if it does already."""

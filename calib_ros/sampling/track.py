@@ -174,41 +174,37 @@ class Track:
         Neumann 1941). None with too few samples, or more spread than that: the arm moves.
         """
         largest = None
-        for values in self._paths(time_ns, newest_ns):
-            if len(values) < TELLING:
+        for columns, rows in self._parts.items():
+            (first,), (end,) = self._bounds(rows, time_ns, np.array([newest_ns]))
+            if end - first < TELLING:
                 return None
+            values = continuous(rows.values[first:end], self._revolute[list(columns)])
             noise = np.sqrt((np.diff(values, 2, axis=0) ** 2).mean(axis=0) / 6.0)
             if (values.std(axis=0) > MOST_SPREAD * noise).any():
                 return None
             largest = max(largest or 0.0, float(noise.max()))
         return largest
 
-    def swing_at_rest(self, time_ns: int, newest_ns: int) -> float | None:
+    def swings_at_rest(self, time_ns: int, rounds: Sequence[int]) -> list[float | None]:
         """Return by how much [rad or m] joints jump to and fro with each sample, or zero.
 
-        After `sort`; None if they do so in motion. The products of second differences with the
-        next one, and the one after it, are -2/3 and 1/6 of their squares for noise, -1 and 1 for
-        two publishers.
+        In some time before each of the stamps, after `sort`; None if they do so in motion.
         """
-        if not any(_swing(values) for _, values in self._recent(time_ns, newest_ns)):
-            return 0.0
-        if self.noise_at_rest(time_ns, newest_ns) is None:
-            return None
-        return max(_swing(values) for values in self._paths(time_ns, newest_ns))
+        found, stamps = np.zeros(len(rounds)), np.array(rounds, dtype=np.int64)
+        for rows in self._parts.values():
+            bounds = self._bounds(rows, time_ns, stamps)
+            found = np.maximum(found, _swings(rows.values, *bounds))
+        return [
+            None if swing and self.noise_at_rest(time_ns, now) is None else swing
+            for swing, now in zip(found.tolist(), rounds, strict=True)
+        ]
 
-    def _paths(self, time_ns: int, newest_ns: int) -> Iterator[FloatArray]:
-        """Yield recent values of each publisher without jumps of a turn."""
-        for columns, values in self._recent(time_ns, newest_ns):
-            yield continuous(values, self._revolute[list(columns)])
-
-    def _recent(
-        self, time_ns: int, newest_ns: int
-    ) -> Iterator[tuple[tuple[int, ...], FloatArray]]:
-        """Yield joints and values of each publisher in some time before a stamp, or a few."""
-        for columns, rows in self._parts.items():
-            end = int(np.searchsorted(rows.stamps, newest_ns, 'right'))
-            first = int(np.searchsorted(rows.stamps, newest_ns - time_ns))
-            yield columns, rows.values[max(0, min(first, end - TELLING)) : end]
+    @staticmethod
+    def _bounds(rows: Rows, time_ns: int, newest_ns: Stamps) -> tuple[Index, Index]:
+        """Return the bounds (K,) of the rows in some time before stamps (K,), a few at least."""
+        end = np.searchsorted(rows.stamps, newest_ns, 'right')
+        first = np.searchsorted(rows.stamps, newest_ns - time_ns)
+        return np.maximum(0, np.minimum(first, end - TELLING)), end
 
     def release(self, before_ns: int) -> int:
         """Drop the samples before a stamp, after `sort`; return how many.
@@ -250,14 +246,24 @@ class Track:
         return stamps, self.at(stamps).joints
 
 
-def _swing(values: FloatArray) -> float:
-    """Return by how much a joint of some (M, n) jumps to and fro with each sample, or zero."""
-    if len(values) < TELLING:
-        return 0.0
-    left = np.diff(values, 2, axis=0)
-    squares = np.einsum('mn,mn->n', left, left)
+def _swings(values: FloatArray, first: Index, end: Index) -> FloatArray:
+    """Return by how much (K,) joints jump to and fro with each of samples (M, n), or zero.
+
+    From `first` (K,) to `end`. The products of second differences with the next one, and the one
+    after it, are -2/3 and 1/6 of their squares for noise, -1 and 1 for two publishers.
+    """
+    found, enough = np.zeros(len(first)), end - first >= TELLING
+    if not enough.any():
+        return found
+    first, end = first[enough], end[enough]
+    left, sums = np.diff(values, 2, axis=0), []
+    for after in range(3):
+        products = np.zeros_like(values)
+        products[: len(left) - after] = left[after:] * left[: len(left) - after]
+        bounds = np.column_stack([first, end - 2 - after]).ravel()
+        sums.append(np.add.reduceat(products, bounds)[::2])
+    squares, turned, again = sums
     least = (1.0 - EXCEPTION) * squares
-    turned = -np.einsum('mn,mn->n', left[1:], left[:-1]) > least
-    again = np.einsum('mn,mn->n', left[2:], left[:-2]) > least
-    largest = squares.max(where=turned & again, initial=0.0)
-    return max(0.5 * float(np.sqrt(largest / len(left))) - AS_FLOATS, 0.0)
+    squares[(-turned <= least) | (again <= least)] = 0.0
+    found[enough] = 0.5 * np.sqrt(squares.max(axis=1) / (end - first))
+    return np.where(found > AS_FLOATS, found, 0.0)
