@@ -163,7 +163,7 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
         if rule is Rule.MISTAKE:
             short = f'{heading}: {"; ".join(each.short for each in texts)}'
         refusal = replace(rules()[rule], refusal='; '.join(texts), in_short=short)
-        needless = ['model to auto'] * situation.auto
+        needless = ['--model auto'] * situation.auto
         needless += ['publisher'] * ('publisher' not in refusal.refusal)
         steps = (each for each in refusal.steps if not any(word in each for word in needless))
         refusal = replace(refusal, steps=tuple(steps))
