@@ -111,14 +111,14 @@ def result_standing(
 ) -> Headline:
     """Return the verdict as a reader sees it first: an arm without visible errors is not bad."""
     if result.accepted:
-        within = _within(result.validation or result.fitted, tolerance)
-        open_yet = 'not' in within or bool(result.remarks)
+        within, sure = _within(result.validation or result.fitted, tolerance)
+        open_yet = not sure or bool(result.remarks)
         whole = result.region is None or result.region.whole
         heading = f'Accepted{"" if whole else " near the measured poses"}{within}'
         heading += ': check first' * bool(result.remarks)
         return Headline('open' if open_yet else 'good', heading)
     if _sound(reasons):
-        within = _within(result.validation or result.fitted, tolerance, 0)
+        within, _ = _within(result.validation or result.fitted, tolerance, 0)
         return Headline('info', f'Nothing to correct{within}: the robot stays as it was')
     return Headline('bad', 'Not accepted: the robot stays as it was')
 
@@ -158,15 +158,15 @@ def _sound(reasons: Sequence[Advice]) -> bool:
     return any(each.sound for each in reasons)
 
 
-def _within(judged: Comparison, tolerance: float | None, when: int = 1) -> str:
-    """Return whether the error before (0) or after is within the tolerance [m], if given."""
+def _within(judged: Comparison, tolerance: float | None, when: int = 1) -> tuple[str, bool]:
+    """Return in words and tell if the error before (0) or after is within a tolerance [m]."""
     if tolerance is None:
-        return ''
+        return '', True
     wanted = f'within the tolerance of {1e3 * tolerance:g} mm RMS'
     verdict = compared(tolerance, *interval_of(judged, when))
     if verdict == 'PASS':
-        return f' and {wanted}'
-    return f', but {"" if verdict == "FAIL" else "perhaps "}not {wanted}'
+        return f' and {wanted}', True
+    return f', but {"" if verdict == "FAIL" else "perhaps "}not {wanted}', False
 
 
 def advice_of(result: Identification) -> tuple[Advice, ...]:
