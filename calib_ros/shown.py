@@ -59,17 +59,18 @@ def of_them(count: int, what: str) -> str:
 def rows_in_words(
     rows: Sequence[int], stamps_ns: NDArray[np.int64], of_messages: bool = False
 ) -> str:
-    """Return measurements, by their numbers from 0, as text: line 2, or poses 3 to 5, 8.
-
-    The stamps (N,) of a table without any are its lines, in whole seconds; those of messages
-    may be such by chance.
-    """
-    lines, fractions = np.divmod(stamps_ns, 10**9)
-    by_line = not (of_messages or fractions.any() or lines.min() <= 0 or lines.max() >= 10**6)
-    numbers = np.take(lines, rows) if by_line else np.add(rows, 1)
+    """Return some of N measurements (N,), from 0, as text: line 2, or poses 3 to 5, 8."""
+    lines = are_lines(stamps_ns, of_messages)
+    numbers = np.take(stamps_ns // 10**9, rows) if lines else np.add(rows, 1)
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     words = [' to '.join(map(str, dict.fromkeys((run[0], run[-1])))) for run in runs]
-    return f'{"line" if by_line else "pose"}{"s" * (len(rows) > 1)} {", ".join(some(words))}'
+    return f'{"line" if lines else "pose"}{"s" * (len(rows) > 1)} {", ".join(some(words))}'
+
+
+def are_lines(stamps_ns: NDArray[np.int64], of_messages: bool = False) -> bool:
+    """Tell whether stamps (N,) are lines of a table, in whole seconds, not such by chance."""
+    lines, fractions = np.divmod(stamps_ns, 10**9)
+    return not (of_messages or fractions.any() or lines.min() <= 0 or lines.max() >= 10**6)
 
 
 def is_time(stamp_ns: int) -> bool:

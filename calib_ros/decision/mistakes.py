@@ -54,7 +54,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import norms
 from calib_ros.settings import EXCEPTION, LEVER
-from calib_ros.shown import rounded, rows_in_words
+from calib_ros.shown import are_lines, rounded, rows_in_words
 
 Tries: TypeAlias = Sequence[tuple[Trial, Suspect]]
 
@@ -208,7 +208,7 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Diagnosis | 
     if found is None or len(rows) == len(seen):
         return found
     poses = rows_in_words(rows.tolist(), seen.stamps_ns, problem.of_messages)
-    among = f' of {len(seen)}' * poses.startswith('pose')
+    among = f' of {len(seen)}' * (not are_lines(seen.stamps_ns, problem.of_messages))
     alike = 'write them as the others ({} reads them)'
     named = (replace(each, remedy=alike.format(each.remedy)) for each in found.suspects)
     where = f'in {poses}{among} alone, '

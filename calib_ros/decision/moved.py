@@ -6,11 +6,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.observations import Observations
-from calib_ros.shown import moment, rows_in_words
+from calib_ros.shown import moment
 
 FRAMES = ('base', 'tool')
 OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
@@ -40,6 +38,8 @@ class Step:
     share: float
     unused: str
     image: int | None = None
+    of_line: bool = False
+    """Whether the stamp is a line of a table, not of a clock."""
     apart: bool = False
     held: bool = False
     """Whether a frame that the chain file holds is wrong from the first pose on."""
@@ -60,8 +60,8 @@ class Step:
         where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
         where += f' of set {self.set + 1}' if self.set else ''
         when = f'stamp {moment(self.stamp_ns)}'
-        line = rows_in_words([0], np.array([self.stamp_ns]))
-        if line.startswith('line'):  # instead of a clock
+        if self.of_line:
+            line = f'line {self.stamp_ns // 10**9}'
             where = line if self.image is None else f'{where}, {line}'
             when = 'if rows are in the order of measurement'
         size = f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'

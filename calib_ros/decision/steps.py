@@ -38,6 +38,7 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.settings import EXCEPTION
+from calib_ros.shown import are_lines
 
 EXPLAINED = 0.5
 """Share of the squared residuals that an explanation needs: most of them (benchmarks/harm.py)."""
@@ -349,6 +350,7 @@ class _Scan:
             share=found.share,
             unused=''.join(unused),
             image=None if seen.pixels is None else int(seen.images[sample]),
+            of_line=are_lines(seen.stamps_ns, problem.of_messages),
             apart=size <= most and _separable(joints, later),
             held=not found.stop,
             slow=found.slow,

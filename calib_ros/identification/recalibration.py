@@ -94,7 +94,8 @@ def recalibrate(
         if others.accepted and 1e3 * np.linalg.norm(away) > OUTLIER * others.after.rms_mm:
             where = f' of set {number + 1}' if 0 < number < len(problem.sets) else ''
             held_out = 'held-out ' if number >= len(problem.sets) else ''
-            name = rows_in_words([pose], problem.all_sets[number].stamps_ns)
+            stamps_ns = problem.all_sets[number].stamps_ns
+            name = rows_in_words([pose], stamps_ns, problem.of_messages)
             return replace(found, odd=f'{held_out}{name}{where}')
     if found.unexplained <= changes.FALSE_ALARM:
         if mistake := mistakes.diagnose_alone(problem, arm):

@@ -19,6 +19,7 @@ from calib_ros.estimation.levels import LEAST_ASIDE, SURE
 from calib_ros.settings import EXCEPTION
 
 COUNT, AT = 60, 26
+LINE = {'stamp_ns': 7 * 10**9, 'of_line': True}
 
 
 def bumped(errors=1.0, size=1e-3, noise=NOISE, **more):
@@ -110,8 +111,8 @@ def test_a_drift_is_compared_with_priors_as_they_are_known(monkeypatch):
         ({}, 'before pose 5 of set 2 (stamp 3.500 s)'),
         ({'image': 2}, 'before image 3 of set 2 (stamp 3.500 s)'),
         ({'set': 0}, 'before pose 5 (stamp 3.500 s)'),
-        ({'stamp_ns': 7 * 10**9, 'set': 0}, 'before line 7 (if rows are in the order'),
-        ({'stamp_ns': 7 * 10**9, 'image': 2}, 'before image 3 of set 2, line 7 (if rows are'),
+        ({**LINE, 'set': 0}, 'before line 7 (if rows are in the order'),
+        ({**LINE, 'image': 2}, 'before image 3 of set 2, line 7 (if rows are'),
         ({'stamp_ns': 10**15}, 'before pose 5 of set 2 (stamp 1000000.000 s)'),
     ],
 )
@@ -119,6 +120,13 @@ def test_the_place_of_a_step_is_told_as_it_is_found(where, told):
     given = {'kind': 'base', 'set': 1, 'sample': 4, 'stamp_ns': 3_500_000_000, 'image': None}
     step = Step('base', thing='the device', size=1e-3, unit='m', share=0.9, unused='', **given)
     assert f'moved by 1 mm (base) {told}' in str(replace(step, **where))
+
+
+@pytest.mark.parametrize('of_messages', [False, True])
+def test_messages_of_whole_seconds_have_no_lines(of_messages):
+    """In simulated time."""
+    told = str(find_step(bumped(of_messages=of_messages)))
+    assert f'before {"pose" if of_messages else "line"} {AT + 1} (' in told
 
 
 def test_sets_have_their_share_of_the_freedoms_of_the_fit():
