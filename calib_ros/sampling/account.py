@@ -20,7 +20,7 @@ class Lost(str):
 
 
 class Cause(str):
-    """Why messages of a `kind` were dropped, for a reader; `why` without the kind."""
+    """Why messages of a `kind` are not in samples, for a reader; `why` without the kind."""
 
     kind: str
     why: str
@@ -45,7 +45,7 @@ class Account:
     samples: int
     held_out: int
     configurations: int
-    unused: dict[str, int]
+    unused: dict[Cause, int]
     dropped: dict[Cause, int]
     notes: dict[str, int]
     foreign_names: tuple[str, ...]

@@ -60,7 +60,7 @@ class Collector:
         self.sampler = Sampler(self._revolute, settings.pose_buffer)
         self.dropped = self.sampler.dropped
         self.waiting = Waiting(ROW_WIDTH, settings.pose_buffer, self.dropped, self.sampler.has)
-        self.unused: Counter[str] = Counter()  # messages normally not used, by cause
+        self.unused: Counter[Cause] = Counter()  # messages normally not used, by cause
         self.notes: Counter[str] = Counter()
 
     def recent_series(self, now_ns: int | None) -> tuple[Series, list[Series]]:
@@ -285,7 +285,7 @@ class Collector:
             equal, contrary = rows.sort()
             if numbered:  # image numbers always differ
                 equal, contrary = equal + contrary, 0
-            self.unused += Counter({f'{kind}: {TWICE}': equal})
+            self.unused += Counter({Cause(kind, TWICE): equal})
             self.dropped += Counter({Cause(kind, CONTRARY): contrary})
 
     def _plan_stops(
@@ -333,15 +333,15 @@ class Collector:
             self._count_causes(cause)
             known, inside = cause == 0, wanted[numbers]
             for k, count in Counter(numbers[known & ~inside].tolist()).items():
-                self.unused[f'measurements: {plan.why[k]}'] += count
+                self.unused[Cause(POSES, plan.why[k])] += count
             early = known & inside & (stamps < calm[numbers])
             if early.any():
-                self.unused['measurements: the arm had just stopped'] += int(early.sum())
+                self.unused[Cause(POSES, 'the arm had just stopped')] += int(early.sum())
             good = np.flatnonzero(known & inside & ~early)
             if len(good):
                 more = len(good) - len(np.unique(numbers[good]))
                 if key.images and more:
-                    self.unused['measurements: another image of a stop that has one'] += more
+                    self.unused[Cause(POSES, 'another image of a stop that has one')] += more
                 motion = self.track.at(stamps[good], standing=not moving)
                 measured.update(numbers[good].tolist())
                 seen = Found(key, numbers[good], rows.stamps[good], rows.values[good])

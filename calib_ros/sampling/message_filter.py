@@ -232,7 +232,7 @@ class MessageFilter:
         self._names, self._frames, self._joint_count = names, frames, joint_count
         self.received: Counter[str] = Counter()
         self.dropped: Counter[Cause] = Counter()
-        self.unused: Counter[str] = Counter()
+        self.unused: Counter[Cause] = Counter()
         self.refused: dict[str, str] = {}  # why the last messages of a kind cannot be used
         self.latest: tuple[int, Sequence[float]] | None = None
 
@@ -269,7 +269,7 @@ class MessageFilter:
                     self.refused[JOINTS] = fault  # the arm's, since its own have ended
             if fault in (OTHERS, NO_VALUES):  # such as a gripper's, or efforts, published apart
                 self.received[JOINTS] += len(stamps)
-                self.unused[f'{JOINTS}: {fault}'] += len(stamps)
+                self.unused[Cause(JOINTS, fault)] += len(stamps)
                 continue
             if fault:
                 self.miss(JOINTS, len(stamps), fault)
@@ -288,7 +288,7 @@ class MessageFilter:
             if recording:
                 yield Piece(columns, places, stamps, values)
             else:
-                self.unused['joints: not recording'] += len(stamps)
+                self.unused[Cause(JOINTS, 'not recording')] += len(stamps)
         if good:  # others among them are only counted
             self.refused.pop(JOINTS, None)
 
@@ -300,7 +300,7 @@ class MessageFilter:
             self.received[POSES] += count
             self.refused.pop(POSES, None)
             if not recording:
-                self.unused['measurements: not recording'] += count
+                self.unused[Cause(POSES, 'not recording')] += count
             elif fault := self._frames.fault(source.device, frame_id, count):
                 self.dropped[Cause(POSES, fault)] += count
                 self.refused[POSES] = fault

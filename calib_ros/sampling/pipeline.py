@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from calib_ros.kinematics.chain import Chain
+from calib_ros.sampling.account import Cause
 from calib_ros.sampling.clocks import Clocks
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.gate import Gate
@@ -71,7 +72,7 @@ class Pipeline:
         sampler, missed = self.collector.sampler, self.collector.unmeasured
         found = of_two_places(sampler.doubled, 0.5 * sampler.rested)  # most of them, by turns
         found += unsettled(sampler.restless, sampler.restless + sampler.rested)
-        between = 0 if sampler.rested else self.collector.unused[f'{POSES}: {MOVING}']
+        between = 0 if sampler.rested else self.collector.unused[Cause(POSES, MOVING)]
         return found + (unmeasured(missed, between) if sampler.rested or between else [])
 
     def _pass(self, come: Iterable[tuple[Slice, bool]]) -> None:

@@ -138,7 +138,7 @@ class CalibrationSession:
         if not self.samples:
             raise InputError('there is no pose to remove')
         sample = self.samples.pop()
-        self._filter.unused['measurements: of a removed pose'] += sample.count
+        self._filter.unused[Cause(POSES, 'of a removed pose')] += sample.count
         self._collector.forget(sample)
         if sample.frame_id:
             self._frames.note(sample.device, sample.frame_id, -sample.count)
