@@ -24,7 +24,7 @@ from streams import (
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.sampling.account import lost
+from calib_ros.sampling.account import Cause, lost
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import Source
 from calib_ros.settings import Mode, Settings
@@ -166,7 +166,7 @@ def test_every_measurement_is_accounted_for(plan, traffic):
 
 
 def test_the_name_of_a_frame_makes_no_loss():
-    cause = 'measurements: in frame "stamping press", not in frame_id "memory"'
+    cause = Cause('measurements', 'in frame "stamping press", not in frame_id "memory"')
     assert lost('measurements', 100, {cause: 50}) == (0.0, '')
 
 
