@@ -358,17 +358,16 @@ class CalibrationNode(Batched):
 
     def _publish_status(self) -> str:
         """Return the status; publish its first words when they change."""
-        words = self.session.status(str(self._identifying.progress), learn=False)
+        state, *rest = told = self.session.told(str(self._identifying.progress))
         trouble = textwrap.shorten(self._archive.trouble, STATUS_LENGTH // 2, placeholder=' ...; ')
-        state, _, rest = words.partition('; ')
         if self._inputs.failures:  # which may explain it
             state = textwrap.shorten(state, STATUS_LENGTH // 2, placeholder=' ...')
-        text = '; '.join((f'{trouble} {state}', *self._inputs.failures, rest))
+        text = '; '.join((f'{trouble} {state}', *self._inputs.failures, *rest))
         text = textwrap.shorten(text, STATUS_LENGTH, placeholder=' ...')
         if text != self._status_text:
             self._status_text = text
             self._status.publish(String(data=text))
-        return words
+        return '; '.join(told)
 
     def _answers(self) -> dict[str, Any]:
         last, observability = self._identifying.last, self._identifying.observability

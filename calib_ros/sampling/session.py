@@ -283,14 +283,16 @@ class CalibrationSession:
         """
         return partial(self._live.update, self.usable)
 
-    def status(self, work: str = '', learn: bool = True) -> str:
-        """Return arm state, other `work`, warnings and the progress of sampling as text.
+    def status(self, work: str = '') -> str:
+        """Return what is `told`, as text; the estimate is updated before."""
+        self._live.update(self.usable)
+        return '; '.join(self.told(work))
 
-        What an operator must do comes first, so that a truncated line keeps it. The estimate is
-        updated before, or only by `learning`.
+    def told(self, work: str = '') -> list[str]:
+        """Return arm state, other `work`, warnings and the progress of sampling, in words.
+
+        What an operator must do comes first, so that a truncated line keeps it.
         """
-        if learn:
-            self._live.update(self.usable)
         parts = [self.state, work]
         if why := self._filter.refused.get(POSES):
             parts.append(f'measurements are refused, {why}')
@@ -304,7 +306,7 @@ class CalibrationSession:
             parts.append(f'pose {number} does not fit the others, was the target moved?')
         fitted = [sample.joints for sample in self.usable if not sample.validation]
         parts += progress(self.chain, fitted, estimate, self.settings)
-        return '; '.join(dict.fromkeys(filter(None, parts)))
+        return list(dict.fromkeys(filter(None, parts)))
 
     # Identification
 

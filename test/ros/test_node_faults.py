@@ -24,7 +24,7 @@ BROKEN = {
     'taking messages': (node_module, 'feed'),
     'the corrected pose': (Keeper, 'publish_pose'),
     'the journal': (Archive, 'write'),
-    'the status': (CalibrationSession, 'status'),
+    'the status': (CalibrationSession, 'told'),
     'expected accuracy or next pose': (LiveEstimate, 'update'),
     'the account': (CalibrationSession, 'account'),
     'judging': (Diagnostics, '_judged'),
@@ -149,7 +149,7 @@ def test_poses_that_no_identification_takes_are_told_by_the_status(cell, recordi
     heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
     cell.spin_until(lambda: heard and 'are they in metres' in heard[-1].status[0].message)
     assert heard[-1].status[0].level != DiagnosticStatus.ERROR
-    assert 'the distances vary by' in cell.node.session.status(learn=False)
+    assert 'the distances vary by' in str(cell.node.session.told())
     cell.refused('identify')
     count = len(heard)
     cell.spin_until(lambda: len(heard) > count + 1)

@@ -56,13 +56,13 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
 def test_the_status_is_short_and_its_first_words_matter(monkeypatch, cell, recording):
     """The rest is in the diagnostics; `ros2 topic echo` cuts texts at 128 characters."""
     words = cell.listen(String, 'calibration_node/status')
-    long = '; '.join(['the arm is moving', *(f'sample {k} of many words' for k in range(20))])
-    monkeypatch.setattr(CalibrationSession, 'status', lambda *_, **__: long)
+    told = ['the arm is moving', *(f'sample {k} of many words' for k in range(20))]
+    monkeypatch.setattr(CalibrationSession, 'told', lambda *_: told)
     heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
     cell.spin_until(lambda: words and words[-1].data.startswith('the arm is moving; sample 0'))
     assert 100 < len(words[-1].data) <= 120
     assert words[-1].data.endswith(' ...')
-    cell.spin_until(lambda: heard and heard[-1].status[0].message.endswith(long))
+    cell.spin_until(lambda: heard and heard[-1].status[0].message.endswith('; '.join(told)))
     trouble = 'poses are in memory only: ' + 'no space left on a device of a long name ' * 5
     monkeypatch.setattr(Archive, 'trouble', f'{trouble}; ')
     cell.spin_until(lambda: words[-1].data.startswith('poses are in memory only: '))
@@ -75,9 +75,7 @@ def test_why_a_topic_gives_nothing_is_in_the_status_beside_a_long_state(monkeypa
     said = '/joint_states is published best effort'
     monkeypatch.setattr(cell.node._inputs, 'failures', [said])
     monkeypatch.setattr(cell.node._inputs, 'look', lambda: None)
-    monkeypatch.setattr(
-        cell.node.session, 'status', lambda *_, **__: 'waiting ' * 20 + '; 0 poses'
-    )
+    monkeypatch.setattr(cell.node.session, 'told', lambda *_: ['waiting ' * 20, '0 poses'])
     status = cell.listen(String, 'calibration_node/status')
     cell.spin_until(lambda: status and said in status[-1].data)
 
