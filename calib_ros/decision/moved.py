@@ -38,8 +38,7 @@ class Step:
     share: float
     unused: str
     image: int | None = None
-    of_line: bool = False
-    """Whether the stamp is a line of a table, not of a clock."""
+    of_line: bool = False  # whether the stamp is a line of a table, not of a clock
     apart: bool = False
     held: bool = False
     """Whether a frame that the chain file holds is wrong from the first pose on."""

@@ -89,13 +89,12 @@ def recalibrate(
             others, _ = _recalibrated(previous, rest, years, growth, new)
         except (np.linalg.LinAlgError, FloatingPointError, InputError):  # too few
             continue
-        chain = others.calibration.chain
-        away = residuals(chain, problem.all_sets[number]).position[pose]
+        seen = problem.all_sets[number]
+        away = residuals(others.calibration.chain, seen).position[pose]
         if others.accepted and 1e3 * np.linalg.norm(away) > OUTLIER * others.after.rms_mm:
             where = f' of set {number + 1}' if 0 < number < len(problem.sets) else ''
             held_out = 'held-out ' if number >= len(problem.sets) else ''
-            stamps_ns = problem.all_sets[number].stamps_ns
-            name = rows_in_words([pose], stamps_ns, problem.of_messages)
+            name = rows_in_words([pose], seen.stamps_ns, problem.of_messages)
             return replace(found, odd=f'{held_out}{name}{where}')
     if found.unexplained <= changes.FALSE_ALARM:
         if mistake := mistakes.diagnose_alone(problem, arm):
