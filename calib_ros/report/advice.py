@@ -169,16 +169,14 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
         refusal = replace(refusal, steps=tuple(steps))
         if rule in {Rule.GAIN, Rule.REGION}:
             refusal = situation.said_of(refusal)
+        first = []
         if rule is Rule.LARGEST_ERROR and situation.outliers:
-            first = OUTLYING.format(situation.outliers)
-            refusal = replace(refusal, steps=(first, *refusal.steps))
+            first = [OUTLYING.format(situation.outliers)]
         if rule is Rule.GAIN and situation.drifts:
-            again = rules()[Rule.DRIFT].again
-            refusal = replace(refusal, steps=(DRIFTS, *refusal.steps), again=again)
+            first, refusal = [DRIFTS], replace(refusal, again=rules()[Rule.DRIFT].again)
         if rule is Rule.REGION and situation.sigma and situation.left * ALIKE < 1.0:
-            finer = FINER.format(1e3 * situation.sigma, 1e3 * situation.left * situation.sigma)
-            refusal = replace(refusal, steps=(finer, *refusal.steps))
-        advised.append(refusal)
+            first = [FINER.format(1e3 * situation.sigma, 1e3 * situation.left * situation.sigma)]
+        advised.append(replace(refusal, steps=(*first, *refusal.steps)))
     for cause, texts in following.items():
         heading = f'Likely consequences of "{rules()[cause].heading}"'
         advised.append(Advice(heading, '', (), '; '.join(texts)))
