@@ -335,8 +335,7 @@ class Collector:
             for k, count in Counter(numbers[known & ~inside].tolist()).items():
                 self.unused[Cause(POSES, plan.why[k])] += count
             early = known & inside & (stamps < calm[numbers])
-            if early.any():
-                self.unused[Cause(POSES, 'the arm had just stopped')] += int(early.sum())
+            self.unused += Counter({Cause(POSES, 'the arm had just stopped'): int(early.sum())})
             good = np.flatnonzero(known & inside & ~early)
             if len(good):
                 more = len(good) - len(np.unique(numbers[good]))

@@ -289,10 +289,7 @@ class CalibrationSession:
         return '; '.join(self.told(work))
 
     def told(self, work: str = '') -> list[str]:
-        """Return arm state, other `work`, warnings and the progress of sampling, in words.
-
-        What an operator must do comes first, so that a truncated line keeps it.
-        """
+        """Return arm state, other `work`, warnings and progress in words, what is urgent first."""
         parts = [self.state, work]
         if why := self._filter.refused.get(POSES):
             parts.append(f'measurements are refused, {why}')
