@@ -110,7 +110,7 @@ def _fit_all(
         problem = replace(problem, learned=Learned(priors, size))
         fitted = fit_from(fitted.chain, problem, simpler, again=True)
         less = _noise_for_priors(fitted.noise, richer)
-        if simpler is None or SUSPICIOUS * less > size:
+        if not richer or SUSPICIOUS * less > size:
             break
         size = less  # too narrow priors had made it larger
         posterior = Inference(fitted, size).likeliest()

@@ -196,3 +196,15 @@ def test_what_harmonics_named_by_the_user_lack_is_noise_to_them():
     seen = measure(true, along_path(60, rng), rng, *NOISE)
     found = fitting.fit(Problem(UR10E, seen, effects=('eccentricity',), **SIGMAS))
     assert found.problem.learned.noise > 0.9 * found.noise.size > 1.0
+
+
+@pytest.mark.parametrize('seed', [4, 5])
+def test_large_harmonics_named_by_the_user_are_no_noise(seed):
+    """With priors of the usual size they were noise, and that made the priors weigh more."""
+    names, rng = members(UR10E, 'eccentricity'), np.random.default_rng(seed)
+    sizes = 1e-3 * rng.normal(size=len(names))
+    true = arm(seed).with_effects(names).with_offsets(dict(zip(names, sizes, strict=True)))
+    seen = measure(true, rng.uniform(-np.pi, np.pi, (25, 6)), rng, NOISE[0], oriented=False)
+    found = fitting.fit(Problem(UR10E, seen, effects=('eccentricity',), **SIGMAS))
+    assert found.problem.learned.noise < 1.5
+    assert rms(found.chain, true, UR10E.random_joints(200, rng)) < 2e-4
