@@ -184,14 +184,20 @@ def test_a_calibration_that_was_not_saved_is_told_of(journal):
 
 
 SLOW_SAVE = """
-import signal, time
+import signal, threading, time
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored below nohup
 from calib_ros.report import page
 from calib_ros.ros import node
 node.JOIN_TIMEOUT = 0.1
+late, close = threading.Event(), node.Archive.close
+def closed(self):  # after the threads that are late were found
+    late.set()
+    return close(self)
+node.Archive.close = closed
 def slow(*given):
     print('rendering', flush=True)
-    time.sleep(4.0)
+    late.wait()
+    time.sleep(0.5)
     return '<html>'
 page.render = slow
 """
