@@ -244,7 +244,10 @@ def scatter_in_words(noise: Noise) -> str:
 
 
 def unmodelled_in_words(result: Identification) -> str:
-    """Return how far joints turn and tilt as no parameter explains; empty if they do not."""
+    """Return how far joints turn and tilt as no parameter explains; empty if they do not.
+
+    Not if held-out poses contradict the fit, which widens all that is expected.
+    """
     lacking = result.posterior.unmodelled
     seen = lacking.waves * lacking.shown  # else assumed
     across = np.hypot(lacking.tilts, np.sqrt(2.0) * seen)
@@ -255,7 +258,7 @@ def unmodelled_in_words(result: Identification) -> str:
         f'Part of the remaining error {come} from the arm and is not in the model, as if joints '
         f'were off by {off} (one sigma). Expected errors include it.'
     )
-    return text if off else ''
+    return text if off and not result.surprise else ''
 
 
 def disturbed_in_words(noise: Noise) -> str:

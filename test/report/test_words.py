@@ -223,10 +223,11 @@ def test_poses_outside_the_region_do_not_lead_to_more_of_them():
 def test_what_the_model_lacks_is_told_where_there_is_any(turns, tilts, consistent, said):
     lacking = SimpleNamespace(turns=turns, tilts=tilts, waves=1.0, shown=0.0)
     noise = Noise(1.03, None, consistent, 0.3, 0.2, ())
-    result = SimpleNamespace(posterior=SimpleNamespace(unmodelled=lacking), noise=noise)
-    told = words.unmodelled_in_words(result)
+    known = {'posterior': SimpleNamespace(unmodelled=lacking), 'noise': noise}
+    told = words.unmodelled_in_words(SimpleNamespace(**known, surprise=0.0))
     assert bool(told) == bool(said)
     assert said in told
+    assert not words.unmodelled_in_words(SimpleNamespace(**known, surprise=4.0))
 
 
 def test_drift_is_errors_shared_in_succession_only():
