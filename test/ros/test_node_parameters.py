@@ -4,7 +4,6 @@
 
 import signal
 from dataclasses import fields
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -112,8 +111,8 @@ def test_settings_change_at_run_time(cell, recording):
     assert all(result.successful for result in results), results
     wanted = {name: changes[name] for name in changes.keys() - {'marker_scale', 'fixed'}}
     assert cell.node.session.settings == Settings(**wanted, fixed=('elbow_joint.a',))
-    told = partial(cell.node.session.status, learn=False)  # another thread learns
-    cell.spin_until(lambda: 'more expected for 0.01 mm' in told())
+    told = cell.node.session.told  # another thread learns
+    cell.spin_until(lambda: 'more expected for 0.01 mm' in '; '.join(told()))
     cell.done('identify')
     after = cell.node.session.calibration.chain
     assert after.table[2, 0] == load_chain('ur10e').table[2, 0] != before.table[2, 0]
