@@ -15,6 +15,7 @@ from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.configurations import count_distinct
+from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.loading import Loaded
@@ -23,7 +24,7 @@ from calib_ros.identification.linear_model import COMPARED
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.effects import group_of
 from calib_ros.report import figures, sections, words
-from calib_ros.report.advice import FAR, GOOD_ARM, GOOD_HERE, SPREAD_OUT, Advice, Situation, advice
+from calib_ros.report.advice import GOOD_ARM, GOOD_HERE, SPREAD_OUT, Advice, Situation, advice
 from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import Poses, poses_of
@@ -195,7 +196,7 @@ def advice_of(result: Identification) -> tuple[Advice, ...]:
 
 def may_be_closer(result: Identification, beyond: bool = False) -> bool:
     """Tell whether effects not tried may explain an error `beyond` what is wanted or the noise."""
-    beyond = beyond or result.noise.position >= FAR
+    beyond = beyond or (result.noise.position > ALIKE and not result.noise.consistent)
     return beyond and not (result.chain.effects or result.verdicts)
 
 

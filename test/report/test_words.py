@@ -162,12 +162,18 @@ def test_what_is_left_is_told_by_the_noise_stated(size, consistent, said):
     assert said in words.scatter_in_words(Noise(size, None, consistent, 0.3, 0.2, ()))
 
 
-@pytest.mark.parametrize('ratio', [0.5, 2.0])
-def test_effects_are_proposed_where_far_more_than_noise_is_left_and_none_was_tried(solved, ratio):
+@pytest.mark.parametrize(
+    ('size', 'consistent', 'proposed'),
+    [(4.6, False, True), (2.0, True, False), (1.2, False, False)],
+)
+def test_effects_are_proposed_where_more_than_noise_is_left_and_none_was_tried(
+    solved, size, consistent, proposed
+):
+    """An arm that eccentricities left at 4.6 times the noise was told nothing."""
     problem, result = solved
-    left = replace(result, noise=replace(result.noise, position=ratio * FAR))
-    steps = report_of(problem, left).steps
-    assert (sentence(CLOSER) in steps) == (ratio > 1.0)
+    noise = replace(result.noise, position=size, consistent=consistent)
+    left = replace(result, noise=noise)
+    assert (sentence(CLOSER) in report_of(problem, left).steps) == proposed
     assert not may_be_closer(replace(left, verdicts=(None,)), beyond=True)
 
 
