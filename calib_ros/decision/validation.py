@@ -206,12 +206,12 @@ def held_out_excess(
     sigmas, found = (problem.sigma_position, problem.sigma_orientation), judged.figures[1].rms_mm
     squares = [each.covariances(sigmas) for each in sets]
     noise = fitted.noise.position * _rms_mm(squares, judged.deciding)
-    if noise > NEARER * found:  # noise alone, as nearly always
+    if noise >= NEARER * found:  # noise alone, as nearly always
         return 0.0, 1.0
     squares = [posterior.expected(each.joints, each.base, each.tool) for each in sets]
     expected = _rms_mm(squares, judged.deciding)
     likely = float(np.hypot(noise, expected))
-    if likely > NEARER * found:
+    if likely > NEARER * found or not expected:  # computed, without noise
         return 0.0, 1.0
     return found / likely, float(np.sqrt(found**2 - noise**2)) / expected
 

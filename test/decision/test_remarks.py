@@ -13,6 +13,7 @@ from calib_ros.apply.simulation import measure
 from calib_ros.decision import plausibility
 from calib_ros.decision.misfits import loose_target
 from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision.validation import held_out_excess
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import TELLING
 from calib_ros.estimation.observations import Observations
@@ -279,3 +280,22 @@ def test_held_out_poses_that_contradict_widen_all_errors_stated(slip, rules):
     assert told == bool(result.surprise) == (slip > 0.0)
     assert expected == pytest.approx(np.sqrt(found**2 - noise**2), rel=0.02 if slip else np.inf)
     assert (expected > noise) == (slip > 0.0)
+
+
+@pytest.mark.parametrize('found', [0.0, 1.0])
+def test_without_noise_and_expected_errors_nothing_is_widened(found):
+    """Computed poses divided by zero."""
+    nothing = SimpleNamespace(
+        distances=None,
+        pixels=None,
+        joints=np.zeros((2, 1)),
+        base='base',
+        tool='tool',
+        covariances=lambda sigmas: np.zeros((2, 6, 6)),
+    )
+    problem = SimpleNamespace(judging=[nothing], sigma_position=1e-4, sigma_orientation=1e-4)
+    fitted = SimpleNamespace(problem=problem, noise=SimpleNamespace(position=0.0))
+    figures = [None, SimpleNamespace(rms_mm=found)]
+    judged = SimpleNamespace(repeated=1, figures=figures, deciding=np.ones(2, bool))
+    posterior = SimpleNamespace(expected=lambda *_: np.zeros((2, 6, 6)))
+    assert held_out_excess(fitted, posterior, judged) == (0.0, 1.0)
