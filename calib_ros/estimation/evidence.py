@@ -248,7 +248,9 @@ class _Columns:
         self.offsets = np.append(fitted.offsets, np.zeros(count - len(names)))
         self.normal = self.about_nominal(self.sums.reduced)
         known: dict[str, float] = {**problem.given} | {**lenses(problem.model)}
-        groups = [None if n in known else size_group(self.chain, n) for n in self.names]
+        higher = {name for name in own if effects.group_of(name) == 'gear'}
+        sized = {n: 'harmonic' if n in higher else size_group(self.chain, n) for n in self.names}
+        groups = [None if name in known else sized[name] for name in self.names]
         self.considered = {*groups[len(names) :]} - {*groups[: len(names)]}
         rest, self._checked = self.arm.stop - len(groups), problem.sigma_scale  # waves
         self._groups = groups + [None] * rest

@@ -18,6 +18,7 @@ TYPICAL = {
     'length': 5e-4,
     'angle': 1e-3,
     'drive': EXPECTED['gear'],
+    'harmonic': EXPECTED['gear'],
     'coupling': 1e-3,
     'frame': 1e-3,
 }

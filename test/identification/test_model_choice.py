@@ -69,7 +69,7 @@ def test_effects_larger_than_usual_are_not_taken_for_noise(unsearched, group, si
     error = rms(result.chain, true, unseen)
     assert error < 2e-5
     expected = result.posterior.expected(unseen)[:, :3, :3]
-    assert 0.5 < np.sqrt(np.trace(expected, axis1=1, axis2=2).mean()) / error < 2.5
+    assert 0.5 < np.sqrt(np.trace(expected, axis1=1, axis2=2).mean()) / error < 1.5
 
 
 @pytest.mark.parametrize(
