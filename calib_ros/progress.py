@@ -80,10 +80,12 @@ class Progress:
         """Run the work in a `with` block; cancelled work never ends it normally."""
         try:
             yield
+            with self._lock:
+                self._refuse_cancelled()
+                self._began = None  # too late to cancel
         finally:
             with self._lock:
-                self._began = None  # too late to cancel
-        self._refuse_cancelled()
+                self._began = None
 
     def cancel(self) -> tuple[bool, str]:
         """End the work after its present stage; return whether it runs, and a text."""
