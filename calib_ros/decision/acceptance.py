@@ -194,7 +194,7 @@ def out_of_scale(scale: float, printed: bool = False, checked: bool = False) -> 
         cause, check = f'the board were stated too {size}', 'Measure the print; if its'
     return (
         f'{text}as if {cause}; then the correction would make the arm worse. {check} scale is '
-        'right, set sigma_scale to its accuracy'
+        'right, set sigma_scale (--sigma-scale) to its accuracy'
     )
 
 
