@@ -46,7 +46,7 @@ from calib_ros.estimation.robust import SUSPICIOUS
 from calib_ros.estimation.samples import gram
 from calib_ros.estimation.shared_errors import gathered, nonnegative
 from calib_ros.estimation.sizes import LEAST_SIZE, REFUTED, SHOWN, SPREAD, TYPICAL, solved
-from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index
 
 
 def unmodelled_errors(
@@ -158,7 +158,7 @@ def _size_of_waves(
 def _variances(
     products: FloatArray, offsets: FloatArray, precision: FloatArray, counts: Index
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the variance (K,) of noise by part of so many rows; zero if nothing is left.
+    """Return the variance (K,) of noise by part of so many rows; zero if they are too few.
 
     By the products of the first P columns, with the prior `precision` (P,) of their `offsets`, and
     their change (P,).
@@ -171,9 +171,10 @@ def _variances(
         taken = np.tensordot(products[:, own, own], root @ root.T) / variances
         left = products[:, -1, -1] - 2.0 * products[:, -1, own] @ mean
         left += mean @ products[:, own, own] @ mean
-        if not ((left > 0.0) & (taken < counts)).all():
+        if not (taken < counts).all():
             return np.zeros(len(products)), mean
-        variances = left / (counts - taken)
+        # waves must not be found in the rounding of poses that a fit meets exactly
+        variances = np.maximum(left / (counts - taken), HALF_THE_DIGITS)
     return variances, mean
 
 
