@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import InputError
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.samples import seen_residuals
+from calib_ros.estimation.pixels import seen_residuals
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import Lens

@@ -15,7 +15,8 @@ from scipy import special
 from calib_ros.estimation.configurations import renumber
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import Observations, numbered
-from calib_ros.estimation.samples import residual_arrays, seen_residuals
+from calib_ros.estimation.pixels import seen_residuals
+from calib_ros.estimation.samples import residual_arrays
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index, norms
 from calib_ros.shown import Shown, as_frame, of_them

@@ -19,9 +19,9 @@ from calib_ros.decision.result import Identification
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import LARGEST_SCALE, SURE
 from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.pixels import seen_residuals
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER
-from calib_ros.estimation.samples import seen_residuals
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 

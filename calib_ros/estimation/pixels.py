@@ -21,12 +21,13 @@ import numpy as np
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.resection import image_products
 from calib_ros.estimation.robust import INNER
-from calib_ros.estimation.samples import BLOCK, Samples, seen_residuals
+from calib_ros.estimation.samples import BLOCK, Both, Samples, cached
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.lens import Projection, require_lens, view
 from calib_ros.kinematics.parameter import LENS_KINDS, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.values import LARGEST
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +75,7 @@ class PixelSamples(Samples):
         """Return products (K, 2, P + 1, P + 1) of rows by fold (N,) (`products_of`)."""
         size = len(names)
         found = np.zeros((count, 2, size + 1, size + 1))
-        for block in self._linearised(chain, names):
+        for block in self.linearised(chain, names):
             inner = image_products(block.columns, block.begins, 6)
             twist = np.ascontiguousarray(block.twist.T)
             outer = inner[:, :, :6] @ twist
@@ -95,7 +96,7 @@ class PixelSamples(Samples):
     def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
         """Yield the rows (P + 1, 2, C) of all points in blocks."""
         shifts = np.empty((self.count, 2, 3))
-        for block in self._linearised(chain, names):
+        for block in self.linearised(chain, names):
             for k in range(2):
                 unit = np.zeros((2, len(block.owner)))
                 unit[k] = self.sigmas[0]
@@ -132,7 +133,7 @@ class PixelSamples(Samples):
         sums = np.add.reduceat(found * bounded, self._begins)
         yield sums / np.sqrt(np.bincount(self._images))[:, np.newaxis], self._images
 
-    def _linearised(self, chain: Chain, names: Sequence[str]) -> Iterator[_Images]:
+    def linearised(self, chain: Chain, names: Sequence[str]) -> Iterator[_Images]:
         """Yield blocks of images with about four BLOCKs of points."""
         seen_by = self.observations
         model = ErrorModel(chain, names, seen_by.base, seen_by.tool)
@@ -167,6 +168,20 @@ class PixelSamples(Samples):
             flat = twist.reshape(len(twist), 2, *axes.shape[1:])
             twist = np.einsum('kcm,pscm->pskm', axes, flat).reshape(twist.shape)
         return axes, origin, twist
+
+
+@cached
+def seen_residuals(chain: Chain, observations: Observations) -> Both:
+    """Return measured minus predicted pixels (N, 2), and as shifts at the board (N, 3) [m].
+
+    Clipped to LARGEST: points behind the camera or far away give meaningless values.
+    """
+    samples = PixelSamples(observations, 1.0)
+    pixels, shifts = np.empty((samples.count, 2)), np.empty((samples.count, 3))
+    for block in samples.linearised(chain, ()):
+        residual = np.clip(block.columns[-1], -LARGEST, LARGEST)
+        pixels[block.part], shifts[block.part] = residual.T, block.seen.at_the_board(residual)
+    return pixels, np.clip(shifts, -LARGEST, LARGEST)
 
 
 def samples_of(

@@ -25,10 +25,8 @@ from numpy.typing import NDArray
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.lens import require_lens, view
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.kinematics.walk import BLOCK as BLOCK
-from calib_ros.values import LARGEST
 
 Both: TypeAlias = tuple[FloatArray, FloatArray]
 """Residuals by position and orientation, or in the image and at the board."""
@@ -142,7 +140,7 @@ class Samples:
         """Yield blocks of `parts` by motion, (M + 1, c, B), and phi (E, B) of the effects."""
         joints, velocity = self.moving(model.chain)
         out = None
-        for start in range(0, self.count, BLOCK):
+        for start in range(0, max(self.count, 1), BLOCK):
             part = slice(start, start + BLOCK)
             if start + BLOCK > self.count:
                 out = None  # the last is shorter
@@ -263,7 +261,7 @@ def _add_products(found: FloatArray, rows: FloatArray, phi: FloatArray, motions:
         found[last:, first:last] += products[:, last - first :].T
 
 
-def _cached(find: Callable[[Chain, Observations], Both]) -> Callable[[Chain, Observations], Both]:
+def cached(find: Callable[[Chain, Observations], Both]) -> Callable[[Chain, Observations], Both]:
     """Cache the residuals of the last chain in the observations."""
 
     @wraps(find)
@@ -279,60 +277,21 @@ def _cached(find: Callable[[Chain, Observations], Both]) -> Callable[[Chain, Obs
     return found
 
 
-@_cached
+@cached
 def residual_arrays(chain: Chain, observations: Observations) -> Both:
     """Return measured minus predicted: position (N, 3) [m], rotation vector (N, 3) [rad].
 
     Distances give (N, 1). Rotation vectors are NaN where not measured.
     """
-    then = observations.earlier(chain.frame(observations.base).delay)
-    distances = observations.distances
-    position = np.empty((len(then), 3 if distances is None else 1))
-    given = observations.given if observations.seen else position
-    orientation = np.full((len(then), 3), np.nan)
-    oriented = observations.oriented & (distances is None)
-    for start in range(0, len(then), BLOCK):
-        part = slice(start, start + BLOCK)
-        q = np.ascontiguousarray(then.joints[part].T)
-        signs = None if then.approach is None else np.ascontiguousarray(then.approach[part].T)
-        axes, origin = chain.trace(q, signs, observations.base, observations.tool)
-        if distances is not None:
-            length = origin[2] if observations.plane else np.linalg.norm(origin, axis=0)
-            position[part, 0] = distances[part] - length
-            continue
-        position[part] = observations.positions[part] - origin.T
-        if observations.seen:
-            position[part] = np.einsum('kcn,nc->nk', axes, position[part])
-            position[part] -= given[part]
-        if oriented[part].any():
-            measured = np.ascontiguousarray(observations.rotations[part].transpose(2, 1, 0))
-            orientation[part] = orientation_error(measured, axes).T
-    orientation[~oriented] = np.nan
+    turned = observations.oriented
+    alike = observations.changed(covariance=None, oriented=np.full_like(turned, turned.any()))
+    plain = Samples(alike, 1.0, 1.0)
+    rows = plain.rows_of(chain, ())[0].T
+    position = np.ascontiguousarray(rows[:, :3])
+    orientation = np.full((len(rows), 3), np.nan)
+    if plain.oriented:
+        orientation[turned] = rows[turned, 3:]
     return position, orientation
-
-
-@_cached
-def seen_residuals(chain: Chain, observations: Observations) -> Both:
-    """Return measured minus predicted pixels (N, 2), and as shifts at the board (N, 3) [m].
-
-    Clipped to LARGEST: points behind the camera or far away give meaningless values.
-    """
-    camera = observations.camera
-    lens = require_lens(chain.frame(camera).lens, camera)
-    then = observations.earlier(chain.frame(observations.base).delay)
-    first = np.flatnonzero(np.diff(then.images, prepend=-1))
-    assert then.pixels is not None
-    assert then.points is not None
-    q = np.ascontiguousarray(then.joints[first].T)
-    signs = None if then.approach is None else np.ascontiguousarray(then.approach[first].T)
-    axes, origin = chain.trace(q, signs, then.base, then.tool)
-    pixels, shifts = np.empty((len(then), 2)), np.empty((len(then), 3))
-    for start in range(0, len(then), 4 * BLOCK):
-        part = slice(start, start + 4 * BLOCK)
-        seen = view(lens, axes, origin, then.images[part], then.points[part].T, then.on_flange)
-        residual = np.clip(then.pixels[part].T - seen.pixels, -LARGEST, LARGEST)
-        pixels[part], shifts[part] = residual.T, seen.at_the_board(residual)
-    return pixels, np.clip(shifts, -LARGEST, LARGEST)
 
 
 def _range_rows(

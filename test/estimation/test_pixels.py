@@ -17,9 +17,8 @@ from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, meas
 from calib_ros.decision.mistakes import diagnose
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.leastsquares import System, products_of, stacked
-from calib_ros.estimation.pixels import PixelSamples
+from calib_ros.estimation.pixels import PixelSamples, seen_residuals
 from calib_ros.estimation.resection import _from_homography, board_poses, resect
-from calib_ros.estimation.samples import seen_residuals
 from calib_ros.identification import identification
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.parameter import Parameter

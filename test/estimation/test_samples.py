@@ -8,7 +8,8 @@ from fits import UR10E, arm
 
 from calib_ros.apply.simulation import Camera, before_camera, measure, photograph
 from calib_ros.estimation import samples as samples_module
-from calib_ros.estimation.samples import Samples, residual_arrays, seen_residuals
+from calib_ros.estimation.pixels import seen_residuals
+from calib_ros.estimation.samples import Samples, residual_arrays
 
 SPREAD = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) + 0.5
 
