@@ -57,17 +57,17 @@ class Design(Shown):
         further poses have its noise. Measured values do not count otherwise: `simulation.measure`
         can make the observations of a problem before anything is measured. Distances are refused.
         """
-        kind = problem.kinds[0]
-        if kind.distance or problem.separations:
+        seen = problem.observations
+        if seen.distances is not None or problem.separations:
             raise InputError('planning needs measured poses or positions, not distances')
         model = problem.model
         priors = problem.prior_sigmas
-        structural = structurally_independent(model, problem.free, problem.kinds)
+        structural = structurally_independent(model, problem.free, problem.sets)
         names: tuple[str, ...] = tuple(n for n in problem.free if n in structural or n in priors)
         scales = (1.0, 1.0)
         if result is None:
             place = Frame(se3.transform(np.eye(3), np.array(ASSUMED_TOOL)))
-            for name in (kind.tool, *(kind.base,) * kind.seen):
+            for name in (seen.tool, *(seen.base,) * seen.seen):
                 if model.all_frames[name] is None:
                     model = model.with_frame(name, place)
             known = np.diag([1.0 / priors.get(name, np.inf) for name in names])
@@ -85,11 +85,11 @@ class Design(Shown):
             chain=model,
             names=names,
             sigma_position=problem.sigma_position * scales[0],
-            sigma_orientation=problem.sigma_orientation * scales[1] if kind.oriented else None,
+            sigma_orientation=problem.sigma_orientation * scales[1] if seen.turned else None,
             known=known,
-            base=kind.base,
-            tool=kind.tool,
-            seen=kind.seen,
+            base=seen.base,
+            tool=seen.tool,
+            seen=seen.seen,
         )
 
     def jacobian(self, joints: FloatArray, seen: bool = False) -> FloatArray:

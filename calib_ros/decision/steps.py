@@ -326,7 +326,7 @@ class _Scan:
         ]
         change = np.sqrt(((np.concatenate(moved) @ found.size) ** 2).mean(axis=0))
         size, turn = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
-        unit, oriented = 'm', any(kind.oriented for kind in problem.kinds)
+        unit, oriented = 'm', any(each.turned for each in problem.sets)
         if group.kind == 'joint':
             size, unit = abs(float(found.size[0])), Parameter(group.names[0]).unit
         elif oriented and turn * problem.sigma_position > size * problem.sigma_orientation:

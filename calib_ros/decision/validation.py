@@ -71,8 +71,8 @@ def _cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Compariso
     groups = problem.configurations
     count = count_distinct(np.concatenate(groups))
     rows = sum(
-        count_distinct(group) * kind.rows
-        for group, kind in zip(groups, problem.kinds, strict=True)
+        count_distinct(group) * each.width
+        for group, each in zip(groups, problem.sets, strict=True)
     )
     folds = _fold_count(problem, names, count, rows)
     if folds < 2:
@@ -164,15 +164,15 @@ def _leave_one_place_out(
         return replace(fitted.system, sets=tuple(chosen), separations=apart)
 
     frames = [name for name in names if before.owns_frame(name)]
-    anywhere, rows = drawn(problem.model, names, problem.kinds)
+    anywhere, rows = drawn(problem.model, names, problem.sets)
     chains: list[list[Chain]] = [[], []]
     for place in places:
         own = [n for base in sorted(place) for n in parameters_of(base)[:3] if n in problem.free]
         others, left = part(place, inside=False), part(place, inside=True)
         rest = [name for name in names if name not in own]
-        seen = zip(rows, problem.kinds, strict=True)
+        seen = zip(rows, problem.sets, strict=True)
         which = [names.index(name) for name in rest]
-        there = [each[:, which] for each, kind in seen if kind.base not in place]
+        there = [each[:, which] for each, one in seen if one.base not in place]
         # without this place a gauge may be free; frames come first, so they are the same alone
         known = independent_in([*there, others.separation_rows(anywhere, rest)[0]], rest)
         kept = {*known, *problem.prior_sigmas}

@@ -41,7 +41,7 @@ def fit(problem: Problem, simpler: SimplerFit | None = None) -> Fitted:
     """Fit what the poses determine."""
     model, separations = problem.model, System((), None, (*problem.separations,)).separation_rows
     structural, held = identifiability.identifiable_and_held(
-        model, problem.free, problem.kinds, separations
+        model, problem.free, problem.sets, separations
     )
     _require_enough(problem, [name for name in structural if name not in problem.prior_sigmas])
     fitted = _fit_all(problem, structural, start_frames(problem), simpler)
@@ -226,14 +226,14 @@ def _guarded(
 
 def _require_enough(problem: Problem, names: Sequence[str]) -> None:
     rows = configurations = 0
-    for each, kind in zip(problem.sets, problem.kinds, strict=True):
+    for each in problem.sets:
         if not len(each):
             raise InputError(f'no pairs to fit between {each.base} and {each.tool}')
         count = int(each.configurations.max()) + 1
-        rows += count * kind.rows
+        rows += count * each.width
         configurations += count
     if rows < len(names):
-        width, sets = problem.kinds[0].rows, len(problem.sets)
+        width, sets = problem.observations.width, len(problem.sets)
         of = f', with frames for {sets} sessions, devices or targets' if sets > 1 else ''
         raise TooFewObservationsError(
             configurations,

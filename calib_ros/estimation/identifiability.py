@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import solve
@@ -28,6 +29,7 @@ DEGENERATE = TYPICAL['angle']
 """Extents below this share of the largest count as zero: of board points, or of the rest of a
 frame's column after those before it. Orientations that vary by less than an arm's own angle
 errors would put a tool anywhere, even kilometres away."""
+A_POSE = Observations.from_arrays(np.zeros((1, 0)), np.zeros((1, 3)), np.eye(3)[np.newaxis])
 
 
 def independent(
@@ -63,32 +65,13 @@ def excited(factor: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
     return independent(factor, names, np.where(frames, DEGENERATE, HALF_THE_DIGITS))
 
 
-@dataclass(frozen=True)
-class Kind:
-    """What a set of observations measures, and between which frames."""
-
-    oriented: bool = True
-    distance: bool = False
-    moving: bool = False
-    base: str = 'base'
-    tool: str = 'tool'
-    socket: bool = False
-    plane: bool = False
-    seen: bool = False
-
-    @property
-    def rows(self) -> int:
-        """Return the number of equations of one configuration."""
-        return 1 if self.distance else 6 if self.oriented else 3
-
-
 def structurally_independent(
     chain: Chain,
     names: Sequence[str],
-    kinds: Sequence[Kind] = (Kind(),),
+    sets: Sequence[Observations] = (A_POSE,),
     extra: Callable[[Chain, Sequence[str]], tuple[FloatArray, FloatArray]] | None = None,
 ) -> tuple[str, ...]:
-    """Return the parameters that a large number of arbitrary poses would determine.
+    """Return the parameters that many arbitrary poses would determine, measured as in the sets.
 
     The others are gauge freedoms of the chain, not a lack of measurements. Frames that are not
     fixed get arbitrary places, because a tool of length zero hides rotations. A complete and
@@ -102,16 +85,16 @@ def structurally_independent(
     Parameters of which those before them leave little come last: with a known tool near the last
     axis a turn would else imitate a length, and end far away.
     """
-    anywhere, rows = drawn(chain, names, kinds)
+    anywhere, rows = drawn(chain, names, sets)
     if extra is not None:
         rows.append(extra(anywhere, names)[0])
     return independent_in(rows, names)
 
 
 def drawn(
-    chain: Chain, names: Sequence[str], kinds: Sequence[Kind]
+    chain: Chain, names: Sequence[str], sets: Sequence[Observations]
 ) -> tuple[Chain, list[FloatArray]]:
-    """Return a chain with arbitrary frames, and the rows (R, P) of each kind at many poses."""
+    """Return a chain with arbitrary frames, and the rows (R, P) of each set at many poses."""
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
     frames = [name for name in names if chain.owns_frame(name)]
@@ -119,22 +102,22 @@ def drawn(
     anywhere = chain.with_offsets(dict(zip(frames, places, strict=True)))
     approach, velocity = rng.choice([-1.0, 1.0], joints.shape), rng.normal(size=joints.shape)
     rows = []
-    for number, kind in enumerate(kinds):
+    for number, each in enumerate(sets):
         posed = joints
-        if kind.socket or kind.plane:
-            posed, place = _meeting(anywhere, np.roll(joints, number, axis=0), kind)
-            shift = dict(zip(parameters_of(kind.base)[:3], -place, strict=True))
+        if each.socket or each.plane:
+            posed, place = _meeting(anywhere, np.roll(joints, number, axis=0), each)
+            shift = dict(zip(parameters_of(each.base)[:3], -place, strict=True))
             anywhere = anywhere.with_offsets({n: x for n, x in shift.items() if n in names})
-        model = ErrorModel(anywhere, names, kind.base, kind.tool)
-        signs, rates = approach[: len(posed)], velocity[: len(posed)] if kind.moving else None
-        jacobian = model.jacobian(posed, signs, rates, kind.seen)
-        if kind.distance:
-            line = anywhere.forward(posed, signs, kind.base, kind.tool)[:, :3, 3]
-            if kind.plane:
+        model = ErrorModel(anywhere, names, each.base, each.tool)
+        signs, rates = approach[: len(posed)], velocity[: len(posed)] if each.moving else None
+        jacobian = model.jacobian(posed, signs, rates, each.seen)
+        if each.width == 1:
+            line = anywhere.forward(posed, signs, each.base, each.tool)[:, :3, 3]
+            if each.plane:
                 line[:] = [0.0, 0.0, 1.0]
             line /= np.linalg.norm(line, axis=1, keepdims=True)
             jacobian = np.einsum('nc,ncp->np', line, jacobian[:, :3])
-        elif not kind.oriented:
+        elif each.width == 3:
             jacobian = jacobian[:, :3]
         rows.append(jacobian.reshape(-1, len(names)))
     return anywhere, rows
@@ -164,7 +147,7 @@ def _compact(rows: FloatArray) -> FloatArray:
 def identifiable_and_held(
     chain: Chain,
     names: Sequence[str],
-    kinds: Sequence[Kind],
+    sets: Sequence[Observations],
     extra: Callable[[Chain, Sequence[str]], tuple[FloatArray, FloatArray]] | None = None,
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the structurally identifiable parameters, and those that only positions determine.
@@ -173,21 +156,22 @@ def identifiable_and_held(
     skewed axes. Such parameters of the arm are held at nominal; if the size is one, by the longest
     length, which distorts it least. `extra` returns further equations (R, P) at a chain.
     """
-    found = structurally_independent(chain, names, kinds, extra)
-    if not all(kind.distance or kind.socket for kind in kinds):
+    found = structurally_independent(chain, names, sets, extra)
+    if not all(each.width == 1 or each.socket for each in sets):
         return found, ()
-    base, tool = kinds[0].base, kinds[0].tool
+    base, tool = sets[0].base, sets[0].tool
     arm = {name for name in names if not chain.owns_frame(name)}
     every = [*parameters_of(base), *parameters_of(tool), *(name for name in names if name in arm)]
-    seen = structurally_independent(chain, every, (Kind(False, base=base, tool=tool),))
+    place = A_POSE.changed(oriented=np.zeros(1, dtype=bool), base=base, tool=tool)
+    seen = structurally_independent(chain, every, (place,))
     visible = [Parameter(name) for name in seen if name in arm]
     held = [name for name in visible if name not in found]
-    sized = not all(kind.socket or kind.plane for kind in kinds)
+    sized = not all(each.socket or each.plane for each in sets)
     if not sized and any(name.is_length for name in held):
         lengths = [name for name in visible if name.is_length]
         longest = max(lengths, key=lambda name: abs(chain.value(name)))
         others = [name for name in names if name != longest]
-        found = structurally_independent(chain, others, kinds, extra)
+        found = structurally_independent(chain, others, sets, extra)
         held = [longest, *(name for name in visible if name not in (*found, longest))]
     return found, tuple(held)
 
@@ -217,19 +201,21 @@ def best_imitation(
     return found, wanted, wanted - own @ found
 
 
-def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:
+def _meeting(
+    chain: Chain, joints: FloatArray, each: Observations
+) -> tuple[FloatArray, FloatArray]:
     """Return joint values (M, n) that bring the target to one place, and that place (3,) [m].
 
     The place of the first pose, or the median height of a plane. Poses that do not arrive within
     20 steps, stretched, are left out.
     """
-    places = chain.forward(joints, base=kind.base, tool=kind.tool)
+    places = chain.forward(joints, base=each.base, tool=each.tool)
     place = places[0, :3, 3].copy()
-    if kind.plane:
+    if each.plane:
         place[:] = 0.0, 0.0, np.median(places[:, 2, 3])
     places[:, :3, 3] = place
-    part = slice(2, 3) if kind.plane else slice(3)
-    found = solve(chain, places, joints, kind.base, kind.tool, part, 20)
+    part = slice(2, 3) if each.plane else slice(3)
+    found = solve(chain, places, joints, each.base, each.tool, part, 20)
     return found.joints[found.converged], place
 
 

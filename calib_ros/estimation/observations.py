@@ -278,6 +278,16 @@ class Observations(Shown):
         return self.points is not None and self.pixels is None
 
     @property
+    def turned(self) -> bool:
+        """Tell whether orientations were measured, or show in images."""
+        return self.pixels is not None or bool(self.oriented.any())
+
+    @property
+    def width(self) -> int:
+        """Return the number of equations of one configuration."""
+        return 1 if self.distances is not None else 6 if self.turned else 3
+
+    @property
     def moving(self) -> bool:
         """Tell whether the arm moved while it was measured, so that a delay matters."""
         return self.velocity is not None and bool(self.velocity.any())

@@ -14,7 +14,6 @@ import numpy as np
 
 from calib_ros.annotated import Fraction, Limit, Positive, Several, check_fields
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import SCATTER
 from calib_ros.estimation.leastsquares import Prior, System
 from calib_ros.estimation.observations import Observations, numbered
@@ -207,23 +206,6 @@ class Problem(Shown):
     def configurations(self) -> tuple[Index, ...]:
         """Return the configuration numbers (N,) of each set to fit, counted over all sets."""
         return numbered(self.sets)
-
-    @cached_property
-    def kinds(self) -> tuple[identifiability.Kind, ...]:
-        """Return what each set measures."""
-        return tuple(
-            identifiability.Kind(
-                bool(each.oriented.any()) or each.pixels is not None,
-                each.distances is not None,
-                each.moving,
-                each.base,
-                each.tool,
-                each.socket,
-                each.plane,
-                each.seen,
-            )
-            for each in self.sets
-        )
 
     @cached_property
     def model(self) -> Chain:

@@ -49,10 +49,7 @@ def start_frames(problem: Problem) -> Chain:
     """
     chain, sigmas = problem.model, (problem.sigma_position, problem.sigma_orientation)
     found: set[str] = set()
-    counts = [
-        count_distinct(each.configurations) * kind.rows
-        for each, kind in zip(problem.sets, problem.kinds, strict=True)
-    ]
+    counts = [count_distinct(each.configurations) * each.width for each in problem.sets]
     pairs = zip(problem.sets, counts, strict=True)
     order = [(not each.seen and count > 2 * IN_A_FRAME, count) for each, count in pairs]
     for number in sorted(range(len(order)), key=order.__getitem__, reverse=True):
@@ -115,7 +112,7 @@ def _check_shown(
         *(independent(triangular_factor(chain, names, rest), names) for rest in rests)
     )
     nominal = replace(chain, joints=problem.chain.joints, effects=problem.chain.effects)
-    if hidden := set(structurally_independent(nominal, names, problem.kinds)).difference(shown):
+    if hidden := set(structurally_independent(nominal, names, problem.sets)).difference(shown):
         frames = ' and '.join(dict.fromkeys(name.owner for name in names if name in hidden))
         raise InputError(
             f'{counted(system.count, "pose")} cannot place the new {frames}: measure more, all '
@@ -126,9 +123,8 @@ def _check_shown(
 def _start_one(
     chain: Chain, observations: Observations, sigmas: tuple[float, float], loss: str
 ) -> Chain:
-    oriented = bool(observations.oriented.any()) and observations.distances is None
     every = movable(chain, ('base', 'tool'))
-    whole = oriented or observations.seen
+    whole = observations.width == 6 or observations.seen
     names = [name for name in every if whole or name.owner == 'base' or name.is_length]
     if not names:
         return chain

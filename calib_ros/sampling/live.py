@@ -120,7 +120,7 @@ class LiveEstimate:
 
 def _fitted(problem: Problem, samples: Sequence[Sample], count: int) -> Update:
     """Return what some samples, which make the problem, tell of all `count` samples."""
-    names = structurally_independent(problem.model, problem.free, problem.kinds)
+    names = structurally_independent(problem.model, problem.free, problem.sets)
     system = replace(problem.system(problem.sets), prior=_priors(problem, names))
     spare = system.rows - len(names)  # the wide priors restrict nothing
     loss = 'redescending' if spare > len(names) else 'none'

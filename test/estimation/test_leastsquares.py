@@ -54,7 +54,7 @@ def still_joint(name, seed):
     seen = measure(faulty(nominal, Cell(), rng), q, rng, 5e-4, oriented=False)
     problem = Problem(nominal, seen)
     start = start_frames(replace(problem, loss='none'))
-    names = structurally_independent(problem.model, problem.free, problem.kinds)
+    names = structurally_independent(problem.model, problem.free, problem.sets)
     return start, names, problem.system(problem.sets)
 
 
@@ -251,7 +251,7 @@ def test_a_fit_knows_how_long_its_next_step_would_be(seed):
     """At most: a fit that is started again has no steps to conclude from."""
     *_, seen = measured_arm(seed, 40)
     problem = Problem(UR10E, seen)
-    names = structurally_independent(problem.model, problem.free, problem.kinds)
+    names = structurally_independent(problem.model, problem.free, problem.sets)
     system = problem.system(problem.sets)
     found = minimise(start_frames(problem), names, system, tolerance=1e-2)
     assert found.next_step_rms < 0.1 * 1e-2

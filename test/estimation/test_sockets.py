@@ -123,7 +123,7 @@ def test_the_frames_that_places_determine_are_the_same_with_and_without_the_arm(
     frames = tuple(name for name in problem.free if problem.model.owns_frame(name))
     assert problem.free[: len(frames)] == frames
     alone, found = (
-        structurally_independent(problem.model, names, problem.kinds[1:])
+        structurally_independent(problem.model, names, problem.sets[1:])
         for names in (frames, problem.free)
     )
     assert alone == tuple(name for name in found if name in frames)
