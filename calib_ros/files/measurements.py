@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import ColumnsError, ConfigError, InputError
-from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import Codes, Columns, check_quaternions, codes_of, lines_in_words
 from calib_ros.files.headers import listed, named_by_option, refuse_separator
 from calib_ros.files.vocabulary import (
@@ -83,31 +82,6 @@ class Measurements:
             elif isinstance(value, tuple):
                 found[item.name] = (value[0][rows], value[1])
         return replace(self, **found)  # type: ignore[arg-type]
-
-    def observations(self) -> Observations:
-        """Return rows of one kind and pair of frames as observations."""
-
-        def optional(values: FloatArray | None, nothing: float) -> FloatArray | None:
-            if values is None or np.isnan(values).all():
-                return None
-            return np.where(np.isnan(values), nothing, values)
-
-        kind = self.kind[0]
-        return Observations(
-            self.stamps_ns,
-            self.joints,
-            self.position if kind == POSE else np.zeros_like(self.position),
-            self.rotation,
-            self.oriented,
-            optional(self.covariance, np.nan),
-            optional(self.approach, 0.0),
-            self.distance if kind in (DISTANCE, PLANE) else None,
-            optional(self.velocity, 0.0),
-            optional(self.acceleration, 0.0),
-            self.delay,
-            socket=bool(kind == SOCKET),
-            plane=bool(kind == PLANE),
-        )
 
     def samples(self) -> Iterator[Sample]:
         """Yield the rows as samples."""

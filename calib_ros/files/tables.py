@@ -13,12 +13,12 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calib_ros.annotated import Count, Positive, as_annotated
 from calib_ros.errors import ColumnsError, InputError, UnknownNameError
-from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import Codes, Columns, columns_of
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.headers import TURNS_LEFT, joints_left_out, name_and_unit, not_read
@@ -171,11 +171,11 @@ def _dataset(
         _, number = distinct_rows(made.codes)
         examples = made.select(np.unique(number, return_index=True)[1])
 
-        def observed(members: Sequence[int]) -> Observations:
+        def columns_of_set(members: Sequence[int]) -> dict[str, Any]:
             rows = np.isin(number, members)
-            return (made if rows.all() else made.select(rows)).observations()
+            return vars(made if rows.all() else made.select(rows))
 
-        found = dataset_of([*examples.samples()], sigmas, observed=observed)
+        found = dataset_of([*examples.samples()], sigmas, columns=columns_of_set)
     place, names = made.frame_id
     world_frame = next((names[k] for k in place.tolist() if names[k]), '')
     return replace(found, world_frame=world_frame, warnings=warnings, by_line=by_line)

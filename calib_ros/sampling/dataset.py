@@ -22,13 +22,19 @@ from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 
+AS_NUMBERS = (
+    *('joints', 'position', 'rotation', 'covariance', 'approach'),
+    *('distance', 'velocity', 'acceleration', 'delay'),
+)
+"""Fields of a sample that are columns of observations."""
+
 
 def collect(
     samples: Sequence[Sample],
     sigmas: tuple[float, float],
     frames: Frames,
     posed: bool = False,
-    observed: Callable[[Sequence[int]], Observations] | None = None,
+    columns: Callable[[Sequence[int]], Mapping[str, Any]] | None = None,
 ) -> Iterator[tuple[list[int], Observations]]:
     """Yield the indices of the samples of each set, and its observations.
 
@@ -36,9 +42,8 @@ def collect(
     [m], orientation [rad]) are those of poses seen by a camera on the flange without a covariance
     of their own. `frames` remembers the names given to earlier samples. With `posed` the poses of
     boards are taken instead of their corners. If the samples are examples of each kind only,
-    `observed` returns the observations of one set by their indices.
+    `columns` returns the columns of one set by their indices.
     """
-    observed = observed or (lambda some: _observations([samples[k] for k in some], posed))
     groups: dict[tuple[Any, ...], list[int]] = {}
     for k, sample in enumerate(samples):
         cornered = sample.view is not None and not posed
@@ -46,7 +51,11 @@ def collect(
         key = (*frames.of(sample), sample.eye_in_hand and not cornered, sample.validation, kind)
         groups.setdefault(key, []).append(k)
     for (base, tool, inverted, *_), members in groups.items():
-        found = replace(observed(members), base=base, tool=tool)
+        some = [samples[k] for k in members]
+        found = _observations(some[0], columns(members) if columns else _columns(some))
+        if some[0].view is not None and not posed:
+            found = _seen(found, some)
+        found = replace(found, base=base, tool=tool)
         yield members, found.inverted(sigmas) if inverted else found
 
 
@@ -80,32 +89,46 @@ def _seen(posed: Observations, samples: Sequence[Sample]) -> Observations:
     )
 
 
-def _observations(samples: Sequence[Sample], posed: bool) -> Observations:
-    def filled(name: str, missing: FloatArray | float) -> FloatArray:
+def _columns(samples: Sequence[Sample]) -> dict[str, Any]:
+    """Return the columns (N, ...) of samples, None where none has a value, NaN where it lacks."""
+    found: dict[str, Any] = {
+        'stamps_ns': np.array([sample.stamp_ns for sample in samples], dtype=np.int64),
+        'oriented': np.array([sample.rotation is not None for sample in samples]),
+    }
+    for name in AS_NUMBERS:
         rows = [getattr(sample, name) for sample in samples]
-        return np.array([missing if row is None else row for row in rows], dtype=np.float64)
+        shape = next((np.shape(row) for row in rows if row is not None), None)
+        lacking = np.eye(3) if name == 'rotation' else np.full(shape or (), np.nan)
+        filled = [lacking if row is None else row for row in rows]
+        found[name] = None if shape is None else np.array(filled, dtype=np.float64)
+    return found
 
-    def optional(name: str, missing: FloatArray | float) -> FloatArray | None:
-        none = all(getattr(sample, name) is None for sample in samples)
-        return None if none else filled(name, missing)
 
-    still = np.zeros(samples[0].joints.shape)  # at rest, approach unknown
-    found = Observations(
-        np.array([sample.stamp_ns for sample in samples], dtype=np.int64),
-        filled('joints', still),
-        filled('position', np.zeros(3)),
-        filled('rotation', np.eye(3)),
-        np.array([sample.rotation is not None for sample in samples]),
-        optional('covariance', np.full((6, 6), np.nan)),
-        optional('approach', still),
-        optional('distance', np.nan),
-        optional('velocity', still),
-        optional('acceleration', still),
-        filled('delay', 0.0),
-        socket=samples[0].socket,
-        plane=samples[0].plane,
+def _observations(first: Sample, columns: Mapping[str, Any]) -> Observations:
+    """Return the observations of columns (N, ...), of one kind with a sample."""
+
+    def optional(name: str, lacking: float = 0.0) -> FloatArray | None:
+        values = columns[name]
+        if values is None or np.isnan(values).all():
+            return None
+        return np.where(np.isnan(values), lacking, values)
+
+    count, rotation = len(columns['joints']), columns['rotation']
+    return Observations(
+        columns['stamps_ns'],
+        columns['joints'],
+        np.zeros((count, 3)) if first.position is None else columns['position'],
+        np.broadcast_to(np.eye(3), (count, 3, 3)) if rotation is None else rotation,
+        columns['oriented'],
+        optional('covariance', np.nan),
+        optional('approach'),
+        None if first.distance is None else columns['distance'],
+        optional('velocity'),
+        optional('acceleration'),
+        columns['delay'],
+        socket=first.socket,
+        plane=first.plane,
     )
-    return found if posed or samples[0].view is None else _seen(found, samples)
 
 
 def check_settings(chain: Chain, settings: Settings) -> None:
@@ -172,12 +195,12 @@ def dataset_of(
     samples: Sequence[Sample],
     sigmas: tuple[float, float],
     posed: bool = False,
-    observed: Callable[[Sequence[int]], Observations] | None = None,
+    columns: Callable[[Sequence[int]], Mapping[str, Any]] | None = None,
 ) -> Dataset:
     """Return the sets of samples with their frames; arguments as in `collect`."""
     frames = Frames()
     sets: tuple[list[Observations], list[Observations]] = ([], [])  # fitted, held out
-    for members, found in collect(samples, sigmas, frames, posed, observed):
+    for members, found in collect(samples, sigmas, frames, posed, columns):
         sets[samples[members[0]].validation].append(found)
     pairs = tuple(socket_pairs(samples, frames))
     free = (each.frame_id for each in samples if not (each.socket or each.plane))
