@@ -43,7 +43,7 @@ from calib_ros.decision.changes import (
     reason_in_words,
     reasons_of,
 )
-from calib_ros.estimation.levels import CLEARLY, KNOWN, TELLING
+from calib_ros.estimation.levels import CLEARLY, KNOWN, TELLING, chance_of
 from calib_ros.files.rows import Row
 from calib_ros.identification.age import YEAR, drift_of
 from calib_ros.kinematics.parameter import Parameter
@@ -173,11 +173,31 @@ def _cause(
         return int(tests.several[:, k].argmin()), (), ()
     lag = int(tests.chances[:, k].min(axis=1).argmin())
     one, two = np.split(tests.chances[lag, k], [len(tests.joints)])
-    if two.min(initial=1.0) < level * (one.min() if one.min() < level else 1.0):
-        return lag, (), tests.groups[len(one) + int(two.argmin())]
+    if two.min(initial=1.0) < level:
+        first, pair = tests.groups[int(one.argmin())], tests.groups[len(one) + int(two.argmin())]
+        if one.min() >= level or _more_by_chance(tests, lag, k, first, pair) < level:
+            return lag, (), pair
     columns = ChangeColumns(row.corrected(), tests.names)
     information = Information(tests.names, tests.weight[lag, k], tests.pull[lag, k])
     return lag, reasons_of(information, columns, float(tests.freedom[k]), most=1.0), ()
+
+
+def _more_by_chance(
+    tests: _Tests, lag: int, k: int, first: Sequence[str], pair: Sequence[str]
+) -> float:
+    """Return the chance that a pair of joints explains as much more than one joint.
+
+    Both with the scatter beside the pair: of two scatters only one may exceed chance.
+    """
+    owners, every = [name.owner for name in tests.names], np.eye(len(tests.names))
+    information = Information(tests.names, tests.weight[lag, k], tests.pull[lag, k])
+    (one, *_, few), (two, *_, more), (whole, *_) = (
+        information.explained(every[:, np.isin(owners, group)]) for group in (first, pair, owners)
+    )
+    others = len(owners) - more
+    gain = (two - one) / float(_above_chance(np.asarray((whole - two) / others), others))
+    known = min(float(tests.freedom[k]), others + len(owners) * (k - LAGS[lag]))
+    return chance_of(gain, more - few, known)
 
 
 class _Tests(NamedTuple):

@@ -61,6 +61,16 @@ def test_a_bump_is_found_within_two_nights_and_its_joint_named(first, rng, name)
         assert name in str(change)
 
 
+def test_a_large_bump_of_one_joint_is_none_of_two(first, rng):
+    """The rest may just seem to scatter more beside one than beside two."""
+    for name in 25 * BUMPS:
+        rows = list(nights(first, rng, 6, (4, name)))
+        bump = 9.0 * SIZES[Parameter(name).unit] * (np.array(first.names) == name)
+        rows[4:] = (replace(row, offsets=row.offsets + bump) for row in rows[4:])
+        (change,) = watch(rows, 100.0).changes
+        assert not change.pair
+
+
 def wobbling(first, rng, rows, stay):
     """Yield the nights of an arm with axes that wobble, in another region after some."""
     sigma = 1e4 * np.sqrt(np.diag(first.covariance))[:, np.newaxis]  # 20 sigma in all, of 0.1 mrad
