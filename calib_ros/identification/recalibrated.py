@@ -19,7 +19,7 @@ from calib_ros.identification.records import reused_in_words
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.settings import Settings
-from calib_ros.shown import Shown
+from calib_ros.shown import Shown, as_html, rounded
 from calib_ros.values import SAME
 
 ANEW = 'measure 30 poses or more and identify them without --previous'
@@ -120,6 +120,14 @@ class Recalibration(Shown):
             changed=((reason,),),
             comparison=replace(self.comparison, before=found.comparison.before),
         )
+
+    def _repr_html_(self) -> str:
+        before, after = (rounded(each.rms_mm) for each in self.comparison.figures)
+        known = (rounded(1e3 * each) for each in (self.known_before, self.known_after))
+        rows = (('[mm]', 'before', 'after'), ('RMS', before, after), ('arm known to', *known))
+        verdict = 'accepted' if self.accepted else 'not accepted'
+        notes = (*map(changes.reason_in_words, self.changed), *filter(None, self.refusal()))
+        return as_html(f'{self.calibration.chain.name}: {verdict}', notes, rows)
 
     def document(self) -> dict[str, Any]:
         """Return the result as plain values, without its figures."""

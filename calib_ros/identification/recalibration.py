@@ -167,7 +167,8 @@ def _recalibrated(
         previous.reused(sets),
         compare(earlier, updated.chain, sets).figures[1].rms_mm,
     )
-    return result, earlier
+    record = {**updated.record, 'accepted': result.accepted}
+    return replace(result, calibration=replace(updated, record=record)), earlier
 
 
 def _movable(chain: Chain, sets: Sequence[Observations], new: Sequence[str]) -> list[str]:

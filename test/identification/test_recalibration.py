@@ -11,7 +11,7 @@ from robots import DATA, needs_data
 
 from calib_ros import Calibration, Problem, identify, load_chain, read_table, recalibrate
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.errors import InputError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.levels import SEVERAL
 from calib_ros.identification.calibration import parse_calibration
 from calib_ros.identification.recalibrated import ANEW
@@ -267,6 +267,11 @@ def test_another_arm_is_not_mended_by_8_poses(earlier):
     assert len(found.changed) <= SEVERAL
     assert not found.accepted
     assert found.refusal()[1] == ANEW
+    with pytest.raises(ConfigError, match='not accepted'):  # the earlier one was
+        parse_calibration(found.calibration.dump(), 'update.yaml', UR10E)
+    shown = found._repr_html_()
+    assert 'not accepted' in shown
+    assert ANEW in shown
 
 
 IN_MM = np.where(np.arange(15)[:, np.newaxis] < 7, 1.0, 1e3)
