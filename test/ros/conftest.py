@@ -41,15 +41,20 @@ def launched(monkeypatch):
 def ended_by(monkeypatch):
     """Return a function that runs the node with parameters until it ends; it returns the status.
 
-    Besides, there may be a parameter file. Signals stay with the tests; no node goes on.
+    Besides, there may be a parameter file. Signals stay with the tests; a node that does not end
+    is given to `spun`, if it may go on.
     """
     from calib_ros.ros import boundary, node
 
     monkeypatch.setattr(boundary, '_handle_signals', lambda handler: None)
-    monkeypatch.setattr(boundary, '_spin', lambda *_: pytest.fail('the node does not end'))
 
-    def run(*parameters, file=None):
+    def endless(*_):
+        pytest.fail('the node does not end')
+
+    def run(*parameters, file=None, names=(), spun=endless):
+        monkeypatch.setattr(boundary, '_spin', spun)
         words = ['--params-file', str(file)] if file else []
+        words += [word for rule in names for word in ('-r', rule)]
         words += [word for given in parameters for word in ('-p', given)]
         return node.main(['--ros-args', *words])
 

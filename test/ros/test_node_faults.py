@@ -58,7 +58,7 @@ def test_a_part_that_fails_does_not_silence_the_others(monkeypatch, cell, record
                 cell.play(part(recording, 10 + 1.5 * k, 11.5 + 1.5 * k))
                 cell.spin_until(lambda n=heard: len(status) > n)
         count = len(diagnostics)
-        cell.spin_until(lambda n=count: len(diagnostics) > n + 2)
+        cell.spin_until(lambda n=count: len(diagnostics) > n + 1)
         found = diagnostics[-1].status[0]
         assert found.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
         assert 'failed' not in found.message

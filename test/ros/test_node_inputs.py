@@ -104,11 +104,11 @@ def test_a_short_queue_that_loses_nothing_is_no_loss(tmp_path, recording):
     override = {'qos_overrides./joint_states.subscription.depth': 1}
     with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
-        publisher = cell.publisher(JointState, 'joint_states')
+        publisher, messages = cell.publisher(JointState, 'joint_states'), joint_messages(recording)
 
         def play(burst, count):
-            for k in range(0, len(recording.joints) // 20, burst):
-                for message in joint_messages(recording)[k : k + burst]:
+            for k in range(0, 20, burst):
+                for message in messages[k : k + burst]:
                     publisher.publish(message)
                 before = cell.node.session.received['joints']
                 cell.spin_until(lambda n=before: cell.node.session.received['joints'] > n)

@@ -2,18 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real node in real rclpy: its parameters, at the start and later."""
 
-import signal
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
 import yaml
-from diagnostic_msgs.msg import DiagnosticArray
 from launching import parameters_of
 from rcl_interfaces import msg, srv
 from rclpy.exceptions import ParameterException
 from rclpy.parameter import Parameter
-from ros_cell import Cell, Child, topics
+from ros_cell import Cell, topics
 
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.kinematics.chain_file import load_chain
@@ -280,33 +278,28 @@ def test_a_parameter_file_without_effect_ends_it(tmp_path, capsys, ended_by, nod
         ('calibration_node', '/**', 'qos_overrides./joint_state.subscription.depth', True),
     ],
 )
-def test_a_parameter_of_all_nodes_is_refused_if_it_may_be_ours(tmp_path, own, also, name, ends):
+def test_a_parameter_of_all_nodes_is_refused_if_it_may_be_ours(
+    tmp_path, capfd, ended_by, own, also, name, ends
+):
     """One file for all nodes of a cell with what they share kept this one from starting."""
     path, sections = tmp_path / 'cell.yaml', {also: {'port': 1}, '/**': {}}
     sections[own] = {'chain': 'ur10e', 'data_dir': str(tmp_path)}
     sections['/**'][name] = 4
     sections = {key: {'ros__parameters': given} for key, given in sections.items()}
     path.write_text(yaml.safe_dump(sections))
-    with Child('--params-file', str(path)) as child:
-        if ends:
-            assert child.end() == 1
-            assert f'unknown parameter "{name}"' in child.output
-        else:
-            said = child.wait_for('ready to calibrate ur10e')
-            assert f'that this one does not have: {name}: they are ignored' in said
+    assert ended_by(file=path, **({} if ends else {'spun': lambda *_: None})) == ends
+    said = f'unknown parameter "{name}"' if ends else f'does not have: {name}: they are ignored'
+    assert said in capfd.readouterr().err
 
 
-def test_the_parameter_file_applies_under_a_namespace(tmp_path):
-    with open(SHIPPED) as file:
-        text = file.read().replace("chain: ''", 'chain: meca500')
-    path = tmp_path / 'parameters.yaml'
-    path.write_text(text)
-    words = ('--params-file', str(path), '-r', '__ns:=/cell_2', '-r', '__node:=arm')
-    given = {'serial': '0012', 'data_dir': tmp_path, 'command': ('-m', 'calib_ros.ros.node')}
-    with Cell() as cell, Child(*words, domain=cell.domain, **given) as child:
-        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
-        assert 'cell_2.arm' in child.wait_for('ready to calibrate meca500')
-        cell.spin_until(lambda: heard)
-        assert heard[0].status[0].hardware_id == '0012'  # text, although ROS makes it 12
-        assert child.end(signal.SIGINT) == 0, child.output
-        assert 'Traceback' not in child.output
+def test_the_parameter_file_applies_under_a_namespace(tmp_path, ended_by):
+    path, found = tmp_path / 'parameters.yaml', []
+
+    def spun(node, *_):
+        serial = node.get_parameter('serial').value  # text, although ROS makes it 12
+        found.append((node.get_fully_qualified_name(), node.session.chain.name, serial))
+
+    path.write_text(SHIPPED.read_text().replace("chain: ''", 'chain: meca500'))
+    given, names = ('serial:=0012', f'data_dir:={tmp_path}'), ('__ns:=/cell_2', '__node:=arm')
+    assert ended_by(*given, file=path, spun=spun, names=names) == 0
+    assert found == [('/cell_2/arm', 'meca500', '0012')]
