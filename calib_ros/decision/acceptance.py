@@ -156,7 +156,7 @@ def _gain_refusals(
     elif scaled and not result.surprise:
         printed = all(each.pixels is not None for each in problem.sets)
         yield Reason(Rule.SCALE, out_of_scale(scaled, printed))
-    elif result.region is None:
+    elif result.region is None or (result.surprise and before.rms_mm < ALIKE * after.rms_mm):
         text = 'the correction is not larger than its own uncertainty, even at the poses measured'
         if result.surprise:
             text += (

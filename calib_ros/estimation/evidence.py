@@ -43,7 +43,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.shown import Shown
 
 MixtureTerm: TypeAlias = tuple[float, FloatArray, FloatArray]
@@ -105,22 +105,29 @@ class Posterior(Shown):
         return self.unmodelled.expected(model, self.square, joints)
 
     def widened(self, factor: float) -> Posterior:
-        """Return it with all expected errors larger by a factor."""
-        count, known = len(self.names), self.unmodelled
-        turns, tilts, waves = (factor * size for size in known.sizes.values())
+        """Return it with all expected errors larger by a factor, but for those of the device."""
+        if factor == 1.0:
+            return self
+        own, waved = np.s_[: len(self.names)], np.s_[len(self.names) :]
+        turns, tilts, waves = (factor * size for size in self.unmodelled.sizes.values())
+        more = (factor**2 - 1.0) * self.square
 
         def wider(each: MixtureTerm) -> MixtureTerm:
             weight, mean, covariance = each
-            size = np.append(np.full(count, factor), np.ones(len(mean) - count))  # units of waves
-            return weight, mean * size / factor, covariance * np.outer(size, size)
+            followed, mean = np.eye(len(mean)), mean.copy()
+            by_waves = np.linalg.solve(covariance[waved, waved], covariance[waved, own])
+            followed[own, waved] = (factor - 1.0) * by_waves.T
+            covariance = followed @ covariance @ followed.T
+            covariance[own, own] += more
+            mean[waved] /= factor  # in units of waves
+            return weight, mean, covariance
 
         return replace(
             self,
-            covariance=self.covariance + (factor**2 - 1.0) * self.square,
-            device=factor * self.device,
+            covariance=self.covariance + more,
             mixture=tuple(map(wider, self.mixture)),
             rival=self.rival and wider(self.rival),
-            unmodelled=known._replace(turns=turns, tilts=tilts, waves=waves),
+            unmodelled=self.unmodelled._replace(turns=turns, tilts=tilts, waves=waves),
         )
 
     def stds_of(self, names: Sequence[str]) -> FloatArray:
@@ -236,7 +243,7 @@ class _Columns:
         whole, lengths, self.scale = self.chain, dict[str, float](), SCALE
         if more:
             whole, lengths, self.scale = lengths_of(self.chain, system)
-        noise = max(given.noise, ROUNDING)  # parameters that follow all exactly leave none
+        noise = max(given.noise, HALF_THE_DIGITS)  # parameters that follow all exactly leave none
         if more or beside or waves:
             nuisances = Nuisances(beside, lengths, bool(more), Unmodelled(waves=waves), kept=True)
             self.sums = nuisance_products(whole, self.names, system, nuisances, noise)

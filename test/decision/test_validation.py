@@ -92,6 +92,7 @@ def refused(before, after, judged, largest_error=0.01, **change):
         not_excited=(),
         chance=None,
         region=1,
+        surprise=0.0,
         validation=Comparison(*parts, judged),
         **given,
     )

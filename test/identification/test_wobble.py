@@ -215,7 +215,7 @@ def test_columns_are_those_of_axes_that_tilt(name):
         np.testing.assert_allclose(across, 0.0, atol=5e-3)  # rows are off by milliradians
 
 
-@pytest.mark.parametrize('seed', [1, 2])
+@pytest.mark.parametrize('seed', [1, 3])
 def test_computed_poses_that_a_fit_meets_exactly_show_no_wobble(seed):
     """Rounding was told as wobble: 3 mm were stated, and poses after a slip went unnoticed."""
     rng, true, seen = measured_arm(seed, 60, (0.0, 0.0))
