@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy import special
 
 from calib_ros.decision.comparison import Comparison, Residuals, compare, joined, residuals
 from calib_ros.estimation.configurations import count_distinct
@@ -15,11 +16,12 @@ from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.identifiability import drawn, independent_in
 from calib_ros.estimation.leastsquares import System, leave_fold_out, minimise
-from calib_ros.estimation.levels import NEARER, TELLING
+from calib_ros.estimation.levels import ALIKE, SURE, TELLING
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER, distances_of
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 
@@ -196,7 +198,7 @@ def held_out_excess(
     """Return by how much held-out positions are further off than noise and expected errors.
 
     Then follows the factor by which the expected errors are too small (after Birge 1932). They
-    are 0 and 1 unless noise and expected errors are clearly nearer to zero.
+    are 0 and 1 unless more than chance (99.9 %) makes them so.
     """
     problem, sets = fitted.problem, fitted.problem.judging
     if judged is None or judged.repeated is None:
@@ -206,14 +208,29 @@ def held_out_excess(
     sigmas, found = (problem.sigma_position, problem.sigma_orientation), judged.figures[1].rms_mm
     squares = [each.covariances(sigmas) for each in sets]
     noise = fitted.noise.position * _rms_mm(squares, judged.deciding)
-    if noise >= NEARER * found:  # noise alone, as nearly always
+    if found <= ALIKE * noise:  # noise alone, as nearly always
         return 0.0, 1.0
     squares = [posterior.expected(each.joints, each.base, each.tool) for each in sets]
     expected = _rms_mm(squares, judged.deciding)
-    likely = float(np.hypot(noise, expected))
-    if likely > NEARER * found or not expected:  # computed, without noise
+    if not expected:  # computed, without noise
+        return 0.0, 1.0
+    likely, by_arm = float(np.hypot(noise, expected)), expected**2 / (noise**2 + expected**2)
+    alone = (1.0 - by_arm**2) / (3.0 * np.count_nonzero(judged.deciding))
+    freedom = 1.0 / (alone + by_arm**2 * _alike(posterior, sets))  # Satterthwaite 1946
+    if found <= likely * max(ALIKE, np.sqrt(special.chdtri(freedom, 1.0 - SURE) / freedom)):
         return 0.0, 1.0
     return found / likely, float(np.sqrt(found**2 - noise**2)) / expected
+
+
+def _alike(posterior: Posterior, sets: Sequence[Observations]) -> float:
+    """Return one by the number of positions that the arm's errors make independent: they share."""
+    few, seen = [each.spread() for each in sets], []
+    for each in few:
+        model = ErrorModel(posterior.chain, posterior.names, each.base, each.tool)
+        seen.append(model.jacobian(each.joints)[:, :3].reshape(-1, len(posterior.names)))
+    rows = np.concatenate(seen)
+    shared = posterior.square @ (rows.T @ rows)
+    return float(np.trace(shared @ shared) / np.trace(shared) ** 2)
 
 
 def _rms_mm(squares: Sequence[FloatArray], which: Flags) -> float:

@@ -267,7 +267,13 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
 
 @pytest.mark.parametrize(
     ('slip', 'finer', 'rules'),
-    [(0.0, 1.0, []), (1e-3, 1.0, []), (1e-3, 5.0, []), (4e-3, 1.0, [Rule.REGION])],
+    [
+        (0.0, 1.0, []),
+        (3e-4, 1.0, []),
+        (1e-3, 1.0, []),
+        (1e-3, 5.0, []),
+        (4e-3, 1.0, [Rule.REGION]),
+    ],
 )
 def test_held_out_poses_that_contradict_widen_all_errors_stated(slip, finer, rules):
     """A zero slipped in between: 100 times further off, 8 % better, was valid everywhere.
