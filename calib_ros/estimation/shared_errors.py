@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 from scipy import linalg, special
@@ -154,6 +155,10 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     return Shared(**correlations, found=found, middles=middles)
 
 
+_Part: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Orthonormal columns (n, c, P), residuals and which are known (n, c), and products (P, P)."""
+
+
 class _Forms:
     """Quadratic forms of residuals, and their moments."""
 
@@ -164,11 +169,7 @@ class _Forms:
         stacked = np.concatenate([*rows, np.pad(extra, ((0, 0), (0, 1)))])
         basis = linalg.qr(stacked[:, :-1], mode='economic', check_finite=False)[0]
         left = stacked[:, -1] - basis @ (basis.T @ stacked[:, -1])
-        self._basis: dict[int, FloatArray] = {}
-        self._residual: dict[int, FloatArray] = {}
-        self._known: dict[int, FloatArray] = {}
-        self._white: dict[int, FloatArray] = {}
-        self.parts: list[int] = []
+        self.parts: dict[int, _Part] = {}
         first = 0
         for part, each in enumerate(units.parts):
             shape = each.shape[1:]
@@ -177,17 +178,18 @@ class _Forms:
             if not each.any():
                 continue
             turned = basis[block].reshape(*shape, -1).transpose(1, 0, 2)
-            self._basis[part] = np.ascontiguousarray(turned)
-            self._residual[part] = left[block].reshape(shape).T
-            self._known[part] = each.any(axis=0).T.astype(float)
-            self._white[part] = gram(basis[block].T)
-            self.parts.append(part)
+            self.parts[part] = (
+                np.ascontiguousarray(turned),
+                left[block].reshape(shape).T,
+                each.any(axis=0).T.astype(float),
+                gram(basis[block].T),
+            )
 
     def _moments(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
         """Return the traces (F, F) tr(A B C B) of forms with matrices (K, n, n) by part."""
         inner, alone = list[FloatArray](), list[FloatArray]()
         for part, own in matrices.items():
-            basis, known, count = self._basis[part], self._known[part], len(own)
+            (basis, _, known, _), count = self.parts[part], len(own)
             crossed, traces = np.zeros((count, basis.shape[2] ** 2)), np.zeros((count, count))
             for seen in np.unique(known, axis=1).T:
                 alike = (known == seen[:, np.newaxis]).all(axis=0)
@@ -201,15 +203,14 @@ class _Forms:
 
     def _values(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
         """Return the forms (F,) r^T A r."""
-        pairs = [(self._residual[part], own) for part, own in matrices.items()]
+        pairs = [(self.parts[part][1], own) for part, own in matrices.items()]
         return np.concatenate([(r * (own @ r)).sum(axis=(1, 2)) for r, own in pairs])
 
     def test(self, part: int, links: csr_array) -> tuple[float, float]:
         """Return the excess correlation of linked residuals and its score, N(0, 1) for none."""
-        basis, residual, known = self._basis[part], self._residual[part], self._known[part]
+        basis, residual, known, white = self.parts[part]
         product = (links @ basis.reshape(len(basis), -1)).reshape(basis.shape)
         product *= known[:, :, np.newaxis]
-        white = self._white[part]
         linked = basis.reshape(-1, len(white)).T @ product.reshape(-1, len(white))
         pairs = float((known * (links @ known)).sum())
         size = float((residual**2).sum())

@@ -135,7 +135,7 @@ def _recalibrated(
 ) -> tuple[Recalibration, Chain]:
     """Return the recalibration, and the earlier arm in new frames."""
     sets = problem.all_sets
-    arm, system = _Arm.of(previous, sets, years, growth), _system(problem, sets, previous)
+    arm, system = _Arm.of(previous, years, growth), _system(problem, sets, previous)
     # corrected axes are never quite parallel
     nominal = previous.before.with_effects([name for name, _ in arm.chain.effects])
     own = [n for end in new for n in parameters_of(end)]
@@ -231,10 +231,8 @@ class _Arm:
     device: FloatArray
 
     @classmethod
-    def of(
-        cls, previous: Calibration, sets: Sequence[Observations], years: float, growth: float
-    ) -> _Arm:
-        """Return the arm of a calibration with covariance and the frames of the sets."""
+    def of(cls, previous: Calibration, years: float, growth: float) -> _Arm:
+        """Return the arm of a calibration with covariance."""
         if previous.covariance is None:
             raise InputError(
                 'the earlier calibration has no parameter covariance: identify it again with this '

@@ -189,10 +189,7 @@ def _rms_residuals(
     squares, ratios, given = [], [], []
     for each, spread, near in zip(sets, spreads, good, strict=True):
         left = residual_arrays(chain, each)[0]
-        scatter = np.full(len(each), sigma**2)
-        if each.covariance is not None:
-            own = np.trace(each.covariance[:, :3, :3], axis1=1, axis2=2) / 3.0
-            scatter = np.where(np.isnan(own), scatter, own)
+        scatter = np.trace(each.covariances((sigma, 1.0))[:, :3, :3], axis1=1, axis2=2) / 3.0
         given.append(scatter[near])
         squares.append((left**2).sum(axis=1)[near])
         ratios.append(((left**2).mean(axis=1) / np.maximum(scatter, spread**2))[near])

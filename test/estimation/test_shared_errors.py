@@ -277,7 +277,7 @@ def test_sizes_are_those_that_make_the_forms_as_large_as_they_are(width, monkeyp
     units = drawn(np.random.default_rng(3), width=width)
     extra = np.random.default_rng(4).normal(size=(2, width))
     forms = shared_errors._Forms(units, extra)
-    assert forms.parts == [0, 1]
+    assert [*forms.parts] == [0, 1]
     kernels = {0: [('successive', 5.0), ('near', 0.5)], 1: [('near', 0.5)]}
     truth = [np.array([2.0, 0.0, 0.7]), np.array([0.3, 5.0])]
     matrices = {
