@@ -183,5 +183,4 @@ def _constant(fitted: Fitted, wire: int) -> float:
 
 
 def _lengthened(each: Observations, more: float) -> Observations:
-    assert each.distances is not None
-    return replace(each, distances=each.distances + more)
+    return replace(each, distances=np.asarray(each.distances) + more)

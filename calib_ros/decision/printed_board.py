@@ -46,9 +46,9 @@ def stretched(problem: Problem, result: Identification) -> str:
     """Return that a board is certainly stretched along one side, in words."""
     for each, far in zip(problem.sets, result.distances, strict=True):
         kept = far < OUTLIER
-        if each.pixels is None or each.points is None or count_distinct(each.images[kept]) < 2:
+        if each.pixels is None or count_distinct(each.images[kept]) < 2:
             continue
-        seen, points = each.select(kept), each.points[kept]
+        seen, points = each.select(kept), np.asarray(each.points)[kept]
         _, shifts = seen_residuals(result.chain, seen)
         if each.on_flange:  # the camera moves instead
             shifts = -shifts

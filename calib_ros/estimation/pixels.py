@@ -53,14 +53,12 @@ class PixelSamples(Samples):
     """One set of pixels laid out for the solver; `sigma_pixel` [px] of each coordinate."""
 
     def __init__(self, observations: Observations, sigma_pixel: float, *_: float) -> None:
-        assert observations.pixels is not None
-        assert observations.points is not None
         begins = np.flatnonzero(np.diff(observations.images, prepend=-1))
         super().__init__(observations.select(begins), sigma_pixel, sigma_pixel)
         self.observations, self.count = observations, len(observations)
         self.rows = 2 * self.count
-        self._pixels = np.ascontiguousarray(observations.pixels.T)
-        self._points = np.ascontiguousarray(observations.points.T)
+        self._pixels = np.ascontiguousarray(np.asarray(observations.pixels).T)
+        self._points = np.ascontiguousarray(np.asarray(observations.points).T)
         self._images, self._begins = observations.images, begins
         self._shifts: FloatArray | None = None
 

@@ -51,8 +51,7 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
 
 def _require_fit(observations: Observations, rms: FloatArray) -> None:
     """Raise unless poses of the board explain the points in most images."""
-    assert observations.pixels is not None
-    index, pixels = observations.images, observations.pixels
+    index, pixels = observations.images, np.asarray(observations.pixels)
     beside_the_centre = pixels - group_means(pixels, index)[index]
     spread = np.sqrt(group_means((beside_the_centre**2).sum(axis=1), index))
     beside = ~(rms < NEARER * spread)
@@ -68,10 +67,9 @@ def uncertainty(observations: Observations, poses: FloatArray, lens: Lens) -> Fl
 
     Of x, y, z [m] and the rotation about the camera's axes [rad], to first order.
     """
-    assert observations.points is not None
     index = observations.images
     rows = np.empty((6, 2, len(index)))
-    _seen(lens, poses, index, observations.points.T).by_twist(rows)
+    _seen(lens, poses, index, np.asarray(observations.points).T).by_twist(rows)
     begins = np.flatnonzero(np.diff(index, prepend=-1))
     return np.asarray(np.linalg.inv(image_products(rows, begins)))
 
@@ -95,27 +93,25 @@ def image_products(rows: FloatArray, begins: Index, first: int | None = None) ->
 
 def resect(observations: Observations, lens: Lens) -> tuple[FloatArray, FloatArray]:
     """Return the poses (M, 4, 4) of the board in the camera, and RMS residuals (M,) [px]."""
-    assert observations.points is not None
-    assert observations.pixels is not None
-    index = observations.images
-    centre = observations.points.mean(axis=0)
-    _, size, axes = np.linalg.svd(observations.points - centre, full_matrices=False)
+    points, pixels = map(np.asarray, (observations.points, observations.pixels))
+    index, centre = observations.images, points.mean(axis=0)
+    _, size, axes = np.linalg.svd(points - centre, full_matrices=False)
     if size[2] > DEGENERATE * size[0]:
         raise InputError(
             'the points of a board must be in a plane: give each face of a body as a board of '
             'its own'
         )
     axes[2] = np.cross(axes[0], axes[1])
-    plane = (observations.points - centre) @ axes.T
-    start = _from_homography(plane[:, :2], lens.rays(observations.pixels), index)
+    plane = (points - centre) @ axes.T
+    start = _from_homography(plane[:, :2], lens.rays(pixels), index)
     local = plane.T * [[1.0], [1.0], [0.0]]
-    best, rms = _refined(start, local, observations.pixels, index, lens)
+    best, rms = _refined(start, local, pixels, index, lens)
     mirrored, normal = best.copy(), best[:, :3, 2]
     sight = best[:, :3, 3] / np.linalg.norm(best[:, :3, 3], axis=1, keepdims=True)
     # half a turn about the normal, then one about the line of sight
     halves = [2.0 * v[:, :, np.newaxis] * v[:, np.newaxis] - np.eye(3) for v in (sight, normal)]
     mirrored[:, :3, :3] = halves[0] @ halves[1] @ best[:, :3, :3]
-    other, others = _refined(mirrored, local, observations.pixels, index, lens)
+    other, others = _refined(mirrored, local, pixels, index, lens)
     poses = np.where((others < rms)[:, np.newaxis, np.newaxis], other, best)
     board = se3.transform(axes.T, centre)  # T_board_plane
     return poses @ se3.invert(board), np.minimum(rms, others)
@@ -123,11 +119,9 @@ def resect(observations: Observations, lens: Lens) -> tuple[FloatArray, FloatArr
 
 def _solvable_images(observations: Observations) -> Flags:
     """Return which images (M,) show enough points, not in line on board or image."""
-    assert observations.points is not None
-    assert observations.pixels is not None
     index = observations.images
     usable = np.bincount(index) >= 4
-    for places in (observations.points, observations.pixels):
+    for places in map(np.asarray, (observations.points, observations.pixels)):
         rest = places - group_means(places, index)[index]
         squares = group_means(rest[:, :, np.newaxis] * rest[:, np.newaxis], index)
         spread = np.linalg.eigvalsh(squares)

@@ -214,7 +214,6 @@ def closed_forms(
 
 def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iterator[Chain]:
     """Yield the chain on the plane z = 0 through poses (N, 4, 4), with given and found tool."""
-    assert observations.distances is not None
     tool = chain.frame('tool')
     tips = [tool.matrix[:3, 3]]
     columns = np.column_stack([arm[:, :3, 3], arm[:, :3, :3].reshape(-1, 9), np.ones(len(arm))])
@@ -227,7 +226,7 @@ def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iter
         axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
         axes[2] = np.cross(axes[0], axes[1])
         place = se3.transform(axes, -axes @ points.mean(axis=0))
-        place[2, 3] += observations.distances.mean()
+        place[2, 3] += np.asarray(observations.distances).mean()
         yield _placed(chain, place, se3.transform(tool.matrix[:3, :3], tip))
 
 

@@ -107,11 +107,10 @@ class Recalibration(Shown):
         `earlier` is the arm before, and `found` has its errors.
         """
         updated = self.calibration
-        assert updated.covariance is not None
         own = [k for k, name in enumerate(updated.names) if Parameter(name).owner == frame]
         names = tuple(Parameter(updated.names[k]) for k in own)
         change = np.array([updated.chain.offset(name, earlier) for name in names])
-        sigma = np.sqrt(np.diag(updated.covariance)[own])
+        sigma = np.sqrt(np.diag(np.asarray(updated.covariance))[own])
         reason = Explanation(frame, names, np.inf, 0.0, 1.0, change, sigma)
         record = {**updated.record, 'changed': [changes.reason_in_words([reason])]}
         return replace(
