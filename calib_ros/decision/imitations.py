@@ -15,7 +15,7 @@ from scipy import special
 
 from calib_ros.estimation.evidence import size_group
 from calib_ros.estimation.fitted import Fitted
-from calib_ros.estimation.gain import inverse_root
+from calib_ros.estimation.gain import about_nominal, inverse_root
 from calib_ros.estimation.levels import NEARER, SURE
 from calib_ros.estimation.sizes import TYPICAL, Evidence
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
@@ -37,24 +37,18 @@ class Imitation:
         self._frames = np.array([chain.owns_frame(name) for name in names])
         self._offsets = np.append(fitted.offsets, np.zeros(len(names) - len(fitted.names)))
         self._variance = max(fitted.size, ROUNDING) ** 2
-        self._matrix, self._vector = self._about_nominal(products)
+        self._matrix, self._vector = about_nominal(products / self._variance, self._offsets)
         typical = np.array([TYPICAL[g] if g else np.inf for g in self._groups])
         matrix = self._matrix + np.diag(self._given + typical**-2.0)
         self._root = inverse_root(matrix, np.diag(matrix))
         self._fit = self._root.T @ self._vector
-
-    def _about_nominal(self, products: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return products (..., P) of columns, and (...) with the residual of the nominal arm."""
-        scaled = products / self._variance
-        matrix = scaled[..., :-1]
-        return matrix, matrix @ self._offsets + scaled[..., -1]
 
     def gains(self, products: FloatArray, own: FloatArray) -> FloatArray:
         """Return half the squares (B,) that moves spare an arm with errors of the usual sizes.
 
         By products (B, K, P + 1) of their columns with the others, and (B, K, K) with each other.
         """
-        cross, vector = self._about_nominal(products)
+        cross, vector = about_nominal(products / self._variance, self._offsets)
         along = cross @ self._root
         whole = own / self._variance + TYPICAL['frame'] ** -2.0 * np.eye(own.shape[-1])
         left = whole - along @ np.swapaxes(along, 1, 2)
@@ -67,7 +61,7 @@ class Imitation:
 
         Nothing speaks for a move that leaves the arm nearly as it is.
         """
-        cross, vector = self._about_nominal(products)
+        cross, vector = about_nominal(products / self._variance, self._offsets)
         matrix = np.block([[self._matrix, cross.T], [cross, own / self._variance]])
         given = np.append(self._given, np.zeros(len(cross)))
         groups = [*self._groups, *['frame'] * len(cross)]

@@ -36,6 +36,7 @@ from calib_ros.estimation.considered import (
     travels,
 )
 from calib_ros.estimation.fitted import Fitted
+from calib_ros.estimation.gain import about_nominal
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.levels import CONFIDENT, OUT_OF_SCALE, PRINTED, SCALE, UNUSUAL
 from calib_ros.estimation.sizes import TYPICAL, Evidence, mixed, solved
@@ -253,7 +254,7 @@ class _Columns:
         self.scaled, count = bool(lengths), len(self.sums.plain) - 1
         self.arm = slice(0, count - self.scaled)  # with waves, in units of their size
         self.offsets = np.append(fitted.offsets, np.zeros(count - len(names)))
-        self.normal = self.about_nominal(self.sums.reduced)
+        self.normal = about_nominal(self.sums.reduced[:-1], self.offsets)
         known: dict[str, float] = {**problem.given} | {**lenses(problem.model)}
         higher = {name for name in own if effects.group_of(name) == 'gear'}
         sized = {n: 'harmonic' if n in higher else size_group(self.chain, n) for n in self.names}
@@ -286,16 +287,11 @@ class _Columns:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the mean (P,) from the fit and the covariance (P, P), for weighted log sizes."""
         weights, tried = zip(*near, strict=True)
-        matrix, vector = (each[self.arm] for each in self.about_nominal(self.sums.plain))
+        matrix, vector = about_nominal(self.sums.plain[self.arm], self.offsets)
         wide = evidence.precision(np.array(tried))[:, self.arm]
         alone = [solved(matrix[:, self.arm], vector, each) for each in wide]
         mean, covariance = mixed(alone, weights)
         return mean - self.offsets[self.arm], covariance
-
-    def about_nominal(self, products: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the normal equations (K, K), (K,) of all offsets from products of their rows."""
-        matrix = products[:-1, :-1]
-        return matrix, matrix @ self.offsets + products[:-1, -1]
 
 
 def _device(

@@ -21,6 +21,15 @@ def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
     return np.asarray(scale[..., np.newaxis] * vectors * lengths[..., np.newaxis, :])
 
 
+def about_nominal(products: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return normal matrix (..., P) and vector (...) of offsets from nominal, now `offsets` (P,).
+
+    By products (..., P + 1) of columns with all and the residual.
+    """
+    matrix = products[..., :-1]
+    return matrix, matrix @ offsets + products[..., -1]
+
+
 def gain_of(products: FloatArray, count: int) -> tuple[float, int, float]:
     """Return the squares that added columns explain of the residual, and in how many directions.
 

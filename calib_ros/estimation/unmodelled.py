@@ -32,6 +32,7 @@ from scipy import special
 
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.evidence import Posterior
+from calib_ros.estimation.gain import about_nominal
 from calib_ros.estimation.identifiability import covariance
 from calib_ros.estimation.joint_errors import (
     Unmodelled,
@@ -101,12 +102,14 @@ def _sizes(
             return 0.0, 0.0, TYPICAL['drive'], False
         left = rows[-1] - np.tensordot(shift, rows[: len(shift)], 1)
         often = _shared(left, part_of, groups)
-        waves, found = _size_of_waves(*_equations(products, offsets, often * variances), given)
+        total = np.tensordot(1.0 / (often * variances), products, 1)
+        waves, found = _size_of_waves(*about_nominal(total[:-1], offsets), given)
         if found is None:
             break
         precision = np.append(given, none + found**-2.0)
     own = np.s_[: len(precision)]
-    matrix, vector = _equations(products, offsets, variances)
+    total = np.tensordot(1.0 / variances, products, 1)
+    matrix, vector = about_nominal(total[:-1], offsets)
     mean, root = solved(matrix[own, own], vector[own], precision)
     scale = np.sqrt(variances)[part_of, np.newaxis]
     left = rows[-1] + np.tensordot(offsets[own] - mean, rows[own], 1)
@@ -119,14 +122,6 @@ def _sizes(
     kernels += [each @ np.swapaxes(each, 1, 2) for each in (turned, tilted)]
     turn, tilt = _random(np.array(kernels), basis, residual[..., 0]).tolist()
     return turn, tilt, waves, found is not None
-
-
-def _equations(
-    products: FloatArray, offsets: FloatArray, variances: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the normal matrix and vector of all columns, for parts (K,) of such variances."""
-    total = np.tensordot(1.0 / variances, products, 1)
-    return total[:-1, :-1], total[:-1, :-1] @ offsets + total[:-1, -1]
 
 
 def _size_of_waves(

@@ -30,6 +30,7 @@ from calib_ros.decision.validation import fold_residuals
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.considered import Nuisances, nuisance_products
+from calib_ros.estimation.gain import about_nominal
 from calib_ros.estimation.leastsquares import System, products_of
 from calib_ros.estimation.levels import SCALE, SEVERAL, TRIED, chance_of
 from calib_ros.estimation.observations import SOME_POSES, Observations, frames_of_sets, numbered
@@ -317,9 +318,8 @@ class _Arm:
             chain = self.chain.with_offsets(dict(zip(self.names, change, strict=True)))
             found = nuisance_products(chain, self.names, system, nuisances, most=system.count)
             products = found.reduced
-            matrix, gradient = products[:-1, :-1], products[:-1, -1]
-            information = Information(self.names, matrix, gradient + matrix @ change)
-            squares = float(products[-1, -1] + change @ (gradient + information.vector))
+            information = Information(self.names, *about_nominal(products[:-1], change))
+            squares = float(products[-1, -1] + change @ (products[:-1, -1] + information.vector))
             change, covariance = information.mean(self.root)
         return _Found(change, covariance, information, squares)
 
@@ -344,8 +344,7 @@ def _judged(
     chains = []
     parts = products_of(chain, arm.names, system, folds).sum(axis=1)
     for products in parts.sum(axis=0) - parts:
-        matrix = products[:-1, :-1]
-        rest = Information(arm.names, matrix, products[:-1, -1] + matrix @ found.change)
+        rest = Information(arm.names, *about_nominal(products[:-1], found.change))
         chains.append((arm.changed(*rest.mean(frames)), arm.changed(*rest.mean(arm.root))))
     before, after = fold_residuals(chains, sets, groups, folds)
     return Comparison(before, after, np.ones(len(before.position), dtype=bool))
