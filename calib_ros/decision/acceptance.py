@@ -193,7 +193,7 @@ def out_of_scale(scale: float, printed: bool = False, checked: bool = False) -> 
     if printed:
         cause, check = f'the board were stated too {size}', 'Measure the print; if its'
     return (
-        f'{text}as if {cause}; then the correction would make the arm worse. {check} scale is '
+        f'{text}as if {cause}; then the correction may make the arm worse. {check} scale is '
         'right, set sigma_scale (--sigma-scale) to its accuracy'
     )
 
