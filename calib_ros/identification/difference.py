@@ -38,7 +38,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
-from calib_ros.shown import Shown
+from calib_ros.shown import Shown, as_html
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -84,6 +84,9 @@ class Difference(Shown):
             reasons = changes.changes_in_words(self.changed)
             return f'{reasons}; nothing else: was it bumped? Predictions differ by {size}'
         return f'many parameters differ, by {size}: identify again, and inspect the robot'
+
+    def _repr_html_(self) -> str:
+        return as_html(self.in_words(), (), (('parameter', 'change'), *self.rows()))
 
     def document(self) -> dict[str, Any]:
         """Return the difference as plain values; distances in mm."""

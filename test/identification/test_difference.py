@@ -136,6 +136,7 @@ def test_a_joint_that_was_bumped_is_named(nights):
     few = replace(first, freedom=5.0)  # of either night
     assert difference(few, second).chance == difference(first, replace(second, freedom=5.0)).chance
     words = found.in_words()
+    assert words in found._repr_html_()
     assert 'elbow_joint.theta by +0.' in words
     assert 'nothing else: was it bumped?' in words
     names, (size, *_) = zip(*found.rows(), strict=True)  # the largest in sigmas
