@@ -95,7 +95,7 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
         found.problem = found.problem or problem
         return _salvaged(path, found, session, defined)
     _check_links(streams)
-    warnings = session.warnings
+    warnings = session.last_warnings
     if problem is not None:
         lost = f'{max(0, expected - count)} of {expected} messages are lost'
         warnings = (*warnings, f'{path} is damaged ({shortened(problem)}): {lost}')
@@ -126,7 +126,7 @@ def _salvaged(
     total = stored.recorded(found.files[0].parent)
     if total is None and found.whole:
         total = found.count
-    warnings = session.warnings
+    warnings = session.last_warnings
     if problem or total != found.count:
         lost = 'how many are lost is not known'
         if total is not None and not (total == found.count and problem == stored.NOT_CLOSED):

@@ -132,6 +132,14 @@ def unmeasured(stops: int, between: int) -> list[Hint]:
     return [Hint(f'{words}?', f'{words}, and are its frames still named as before?')]
 
 
+def unstopped(stops: int, moving: int) -> tuple[str, ...]:
+    """Tell that a motion had hardly any stop, but `moving` measurements."""
+    if stops >= FEW or moving < NO_ACCIDENT:
+        return ()
+    words = f'{moving} measurements came in motion, hardly any at a stop: stop at each pose'
+    return (f'{words}, or set mode to continuous (--mode continuous)',)
+
+
 def unseen(images: int, samples: Sequence[Sample], reason: str) -> list[Hint]:
     """Report that the images of many stops are not used, and why the last of them is not."""
     stops = images + sum(each.view is not None for each in samples)

@@ -13,7 +13,7 @@ from calib_ros.sampling.account import Cause
 from calib_ros.sampling.clocks import Clocks
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.gate import Gate
-from calib_ros.sampling.hints import Hint, of_two_places, unmeasured, unsettled
+from calib_ros.sampling.hints import Hint, of_two_places, unmeasured, unsettled, unstopped
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice
 from calib_ros.sampling.stops import MOVING
@@ -74,6 +74,13 @@ class Pipeline:
         found += unsettled(sampler.restless, sampler.restless + sampler.rested)
         between = 0 if sampler.rested else self.collector.unused[Cause(POSES, MOVING)]
         return found + (unmeasured(missed, between) if sampler.rested or between else [])
+
+    def unstopped(self) -> tuple[str, ...]:
+        """Tell of a motion with hardly any stop, of which mode continuous takes all."""
+        if self.collector.settings.mode != 'dwell':
+            return ()
+        moving = self.collector.unused[Cause(POSES, MOVING)]
+        return unstopped(self.collector.sampler.rested, moving)
 
     def _pass(self, come: Iterable[tuple[Slice, bool]]) -> None:
         error: Exception | None = None

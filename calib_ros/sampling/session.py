@@ -237,6 +237,11 @@ class CalibrationSession:
         return tuple(hint.text for hint in self.hints)
 
     @property
+    def last_warnings(self) -> tuple[str, ...]:
+        """Return warnings about a motion that has ended; before it may still stop."""
+        return self.warnings or self._pipeline.unstopped()
+
+    @property
     def hints(self) -> list[Hint]:
         """Return what looks wrong in the received messages."""
         in_sockets = self.settings.mode == 'triggered' and self.received  # perhaps: not measured
@@ -269,7 +274,7 @@ class CalibrationSession:
     @property
     def summary(self) -> str:
         """Return the account of the messages and the warnings as text."""
-        return '; '.join((str(self.account()), *self.warnings))
+        return '; '.join((str(self.account()), *self.last_warnings))
 
     @property
     def estimate(self) -> Estimate | None:

@@ -135,6 +135,20 @@ def test_the_status_tells_of_measurements_only_between_the_stops():
     assert 'between the stops, none at one: do the clocks agree?' in made.status()
 
 
+@pytest.mark.parametrize('moves', [True, False])
+def test_a_motion_without_stops_is_told_of_mode_continuous(moves):
+    """It was 'too few poses, measure 30 or more', of a recording that calibrates as it is."""
+    made = session()
+    motion = stops(UR5E.random_joints(8, np.random.default_rng(1)), move=12.0 if moves else 1.0)
+    source, kind, measured = tracker()
+    for time in np.arange(0.0, 14.0, 0.04).tolist():
+        (stamp,), (row,) = stamps(np.array([time])).tolist(), motion([time])
+        state = of_joints(joint_state(stamp, UR5E.joint_names, row.tolist()))
+        take(made, state, (source, kind, measured(stamp, row)))
+    made.finish()
+    assert ('set mode to continuous (--mode continuous)' in made.summary) == moves
+
+
 def test_the_status_names_a_sample_that_does_not_fit():
     given = samples(50)
     made = session(given[:45])
