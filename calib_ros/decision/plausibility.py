@@ -136,9 +136,11 @@ def _sessions(problem: Problem, result: Identification) -> str:
     if worst > NEARER * result.noise.position:
         return ''
     return (
-        f'one arm does not fit all sessions: alone each fits {result.noise.position / worst:.1f} '
-        'times as well or better. Is it the same robot, did nothing happen to it in between, and '
-        'are the devices true to scale? Identify each alone (--session) and compare them'
+        'one arm does not fit all sessions or devices: alone each fits '
+        f'{result.noise.position / worst:.1f} times as well or better '
+        f'({", ".join(session[0].base for session in sessions)}). Is it the same robot, did '
+        'nothing happen to it in between, and are the devices true to scale? Identify each alone '
+        '(--session, or only its rows or topic) and compare them'
     )
 
 

@@ -81,6 +81,15 @@ def test_two_robots_in_two_sessions_are_not_averaged(seed, alike):
     assert said == ([] if alike else [Rule.MISTAKE])
 
 
+def test_a_device_beside_another_that_is_out_of_scale_is_told_as_a_device():
+    """It was told as a session, to be identified alone by --session, of a table without any."""
+    other = replace(seen_of(arm(0), 1, 40, oriented=False), base='base_lab', tool='tool_ball')
+    result = identify(Problem(UR, seen_of(arm(0), 1, 40), more=[scaled(other, 3000.0)]))
+    (said,) = [each for each in result.refusals if NOT_OF_ONE_ARM in each]
+    assert 'sessions or devices: alone each fits' in said
+    assert '(base, base_lab)' in said
+
+
 def test_the_share_explained_is_that_of_least_squares():
     added = effects.members(UR, 'coupling')
     true = arm(3).with_effect_values(dict.fromkeys(added, 2e-3))
