@@ -126,7 +126,7 @@ def _of_text(path: Path, layout: Layout) -> _Content:
     head = re.match(r'#\t(.*)\n(?!\d+\t)(.*)', text)  # a count may be beside an empty cell
     text = text[2:] if head and head[1].count('\t') == head[2].count('\t') else text
     text = re.sub(r'(?m)^(?!#\t)(?:[#%]+[ \t]+|//[ \t]*)(?=[A-Za-z])', '', text)
-    if text.startswith('"') and not re.search(r'(?m)^(?!"[^"\n]*"$)[^\n]', text):  # one cell each
+    if not re.search(r'(?m)^(?!"[^"\n]*"$)[^\n]', text):  # one cell each
         text = re.sub('(?m)^"|"$', '', text)
         notes.append('whole lines are in quotation marks: read without them')
     guessed = _separator(path, text)
@@ -264,9 +264,7 @@ def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tupl
         signs = [cell.strip('[]() ') for cell in cells]
         whole = any(sign.lower() in UNIT_SIGNS for sign in signs)  # are units, not names
         units = [
-            UNIT_SIGNS.get(s.lower())
-            or name_and_unit(c)[1]
-            or s * (whole and s.lower() not in MISSING)
+            name_and_unit(c)[1] or s * (whole and s.lower() not in MISSING)
             for s, c in zip(signs, cells, strict=True)
         ]
         pairs = zip_longest(header, units[: len(header)])

@@ -82,8 +82,8 @@ def bad_inputs():
     yield 'simulate, no poses', ('simulate', 'b', '--chain', 'ur5e', '--poses', '-1'), 'poses'
     yield 'simulate, seed', ('simulate', 'b', '--chain', 'ur5e', '--seed', '-1'), 'seed'
     yield 'no calibration', ('compare', 'none', 'none'), 'at none: give the folder written by ide'
-    book = ('plan', '--chain', 'ur5e', '--candidates', 'poses.xlsx')
-    yield 'a workbook of candidates', book, 'poses.xlsx: it is a workbook, expected a table as te'
+    book = ('plan', '--chain', 'ur5e', '--candidates', 'poses.XLSX')
+    yield 'a workbook of candidates', book, 'poses.XLSX: it is a workbook, expected a table as te'
     yield 'a folder as arm', (*chain_of, 'folder'), 'folder is a folder, no arm: '
     yield 'not accepted', ('compare', 'refused', 'none'), 'refused was not accepted'
     yield (
@@ -145,7 +145,7 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     (tmp_path / 'fanuc.txt').write_text('/PROG  CAL\n/POS\nP[1]{\n  J1= 1.0 deg\n};\n')
     (tmp_path / 'universal.csv').write_text('def cal():\n  movej([1.0, 2.0])\nend\n')
     (tmp_path / 'start.dtx').write_text('<?xml version="1.0"?><Database/>')
-    (tmp_path / 'poses.xlsx').write_bytes(b'PK\3\4\0')
+    (tmp_path / 'poses.XLSX').write_bytes(b'PK\3\4\0')
     (tmp_path / 'shot.png').write_bytes(b'\x89PNG\xff')
     for folder, file in (('folder', ''), ('refused', 'result.json'), ('shots', '1.pgm')):
         (tmp_path / folder).mkdir()

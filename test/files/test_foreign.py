@@ -322,6 +322,7 @@ def test_joint_values_that_stand_a_row_below(read):
         ('q1;q2;x;y;z\n1;2;3;4;five\n', {}, 'line 2: .* must be a finite number, not .five'),
         ('q1;q2;x;y;z\n1;2;3;4;1.234,5\n', {}, 'without the marks between thousands'),
         ('q1,q2,x,y,z\n1°,2°,3 m,4 m,5 m\n', {}, 'no rows of numbers .*; line 2 has "1°"'),
+        ('note,q1,q2,x,y,z\nno\n', {}, 'no rows of numbers in the columns named'),
         ('q1,q2,x,y,z\n1,2,3,4,5\n1,,3,4,5\n', {}, 'line 3: q'),
         ('a,b,x,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'c', 'q2': 'b'}}, 'no column c'),
         ('a,b,a,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'a'}}, 'comes 2 times: name it by its'),

@@ -49,6 +49,10 @@ FORMS = {
     'a mark and a tab before the header': '%\t' + PLAIN.replace(',', '\t'),
     'a remark in every row': re.sub('(?m)(?<=[0-9])$', ',ok', PLAIN),
     'other separators in quotes': 'note,' + PLAIN.replace('\n', '\n"a; b; c; d; e; f, g",', 3),
+    'semicolons in a remark': 'note,' + PLAIN.replace('\n', '\nok; again,', 3),
+    'blank cells between bars': re.sub('(?m)(?<=.)$', ' | | | | | | |', PLAIN.replace(',', '|')),
+    'lines of an old Macintosh': ('# two joints\n# ' + PLAIN).replace('\n', '\r'),
+    'whole lines in quotes on Windows': re.sub('(?m)^.+$', r'"\g<0>"\r', PLAIN),
 }
 
 

@@ -85,6 +85,8 @@ def test_workbooks(tmp_path, monkeypatch):
     assert_same(read_table(path, 2, foreign=Foreign(Layout(sheet='measured'))), None)
     with pytest.raises(InputError, match='no sheet "other"; it has first, measured'):
         read_table(path, 2, foreign=Foreign(Layout(sheet='other')))
+    with pytest.raises(InputError, match=r'sheet "measured".* no column J1; line 2 has "q1'):
+        read_table(path, 2, foreign=Foreign(Layout(columns={'q1': 'J1', 'q2': 'q2'})))
     other = book.create_sheet('later')
     other.append(NAMES)
     book['first'].sheet_state = 'hidden'
