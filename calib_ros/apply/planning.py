@@ -325,7 +325,7 @@ def fewest(choice: Choice, wanted: float) -> Index:
     if best > wanted:
         raise InputError(
             f'all {len(candidates)} candidates together predict {rounded(1e3 * best)} mm, '
-            f'{1e3 * wanted:g} mm are wanted: give more candidates (--draw, --candidates), a '
+            f'but {1e3 * wanted:g} mm is wanted: give more candidates (--draw, --candidates), a '
             'more accurate device (--sigma-position), or a larger --accuracy'
         )
     count = len(excited.names)  # poses determine several parameters each

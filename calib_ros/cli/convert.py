@@ -50,7 +50,7 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
         table = loading.table(options.csv, chain, Settings(), common.sessions_of(options))
     except CalibrationError as err:
         if re.search('--(?!chain|session)[a-z]', told := str(err)):  # no cell of a table
-            told += '; these are options of calib_ros import, whose table csv2bag takes'
+            told += '; these are options of calib_ros import: convert the table with it first'
         raise InputError(told) from err
     for warning in table.warnings:
         screen.warn(warning)
@@ -63,8 +63,8 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
         or not all((x.oriented == oriented).all() for x in every)
     ):
         raise InputError(
-            'a bag can hold only poses or positions of one session, fixed device and target, all '
-            'with an orientation or none, and some of them to fit'
+            'a bag can hold only poses or positions of one session, one fixed device and one '
+            'target, all with an orientation or none, and at least one to fit'
         )
     lost = {
         'covariance': 'covariances',

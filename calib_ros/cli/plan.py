@@ -29,7 +29,7 @@ from calib_ros.report.applied import plan_report
 TESTS = 'P1 to P5 of ISO 9283 in a cube of {:.3f} m, in {}; collisions are not checked'
 VISIT = 'visit P1 to P5 in turn, 30 times, and measure each time'
 NOISE = 'device noise: {:g} mm in each direction (--sigma-position)'
-WITH_TURNS = 'orientations are measured too (of a reflector alone: --measured position)'
+WITH_TURNS = 'orientations count as measured, too (for a reflector alone: --measured position)'
 NOT_OF_TESTS = ('poses', 'accuracy', 'candidates', 'task', 'taken', 'draw', 'criterion', 'apart')
 ORIENTED = 'various orientations', 'one orientation'
 

@@ -223,7 +223,7 @@ def _deserialiser(defined: Definitions) -> Deserialise:
             found = get_types_from_idl(text) if idl else get_types_from_msg(text, kind)
             store.register({k: each for k, each in found.items() if k not in store.fielddefs})
         except Exception as err:  # a damaged definition fails in many ways
-            raise InputError(f'the bag defines {kind} by what cannot be read: {err}') from err
+            raise InputError(f'the definition of {kind} in the bag cannot be read: {err}') from err
     return partial(_decoded, store)
 
 

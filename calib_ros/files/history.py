@@ -45,7 +45,7 @@ class History:
             raise ConfigError(f'a history cannot be at {place}: {err}') from err
         self._local = is_local(self._files)
         if self._local and Path(self._root).exists() and not Path(self._root).is_dir():
-            raise ConfigError(f'a history must be a folder: {place} is none')
+            raise ConfigError(f'a history must be a folder: {place} is not one')
 
     def file(self, row: Row) -> bool:
         """Add a row; return False if it exists."""

@@ -86,8 +86,8 @@ def refuse_nominal(columns: Columns, remarks: Iterable[Cells]) -> None:
     for line, nominal, text in held:
         if nominal and not all(each for _, each, _ in held):
             raise InputError(
-                f'{columns.path}, line {line}: the rows below "{text}" may be nominal, others are '
-                'not called so: leave out those that were not measured, or that line'
+                f'{columns.path}, line {line}: the rows below "{text}" may be nominal, the others '
+                'not: leave out the rows that were not measured, or that line'
             )
 
 

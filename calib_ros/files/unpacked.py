@@ -70,7 +70,7 @@ def _with_log(file: Path, target: Path) -> None:
         return
     if pages == 0 and _log(file).stat().st_size > 32:  # more than its header
         raise InputError(
-            f'{_log(file)} is damaged, what was recorded last cannot be read: copy it again, or '
+            f'{_log(file)} is damaged, so the last messages cannot be read: copy it again, or '
             'move it away to use the rest'
         )
 

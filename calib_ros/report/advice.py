@@ -61,7 +61,7 @@ def _unwrapped(text: str) -> str:
 
 
 GOOD_ARM = Advice(
-    'There is nothing to correct that this device could see',
+    'There is nothing to correct that this device can see',
     'The error is within the stated noise of the measuring device: the arm is as good as this '
     'device can see.',
     ('To look for smaller errors, measure with a more accurate device.',),

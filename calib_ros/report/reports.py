@@ -359,10 +359,10 @@ def _determined(result: Identification) -> Section:
         'Expected error of positions predicted over the whole joint range: '
         f'{sigma["median"]:.3f} mm (median), {sigma["max"]:.3f} mm (largest).',
         f'Observability indices: {words.observability_in_words(result)}; the larger, the better. '
-        'Of the singular values of the Jacobian, in stated sigmas per metre or radian, O1 is the '
-        'geometric mean over the square root of the number of poses, O2 the smallest over the '
-        'largest, O3 the smallest, O4 its square over the largest, O5 one over the sum of the '
-        'inverses.',
+        'From the singular values of the Jacobian, in stated sigmas per metre or radian: O1 is '
+        'their geometric mean divided by the square root of the number of poses, O2 the smallest '
+        'divided by the largest, O3 the smallest, O4 its square divided by the largest, O5 one '
+        'divided by the sum of the inverses.',
         weak and f'Weakly determined (std above {1e3 * words.WEAK:g} mm or mrad): {weak}.',
         head=('kept nominal', 'cannot be told apart from') if result.gauges else (),
         rows=tuple(

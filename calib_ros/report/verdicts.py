@@ -164,7 +164,7 @@ def hints(found: Verification) -> list[str]:
         )
     if rms > before and not (found.mistake or found.uncorrected or causes(found)):
         whose = '' if found.outside > 0.5 else ': is the calibration that of this robot?'
-        lines.append(f'the nominal arm would be nearer{whose}')
+        lines.append(f'the nominal arm has the smaller error{whose}')
     return lines
 
 
@@ -188,9 +188,9 @@ def causes(found: Verification) -> list[str]:
         )
     elif (found.common if found.common < NEARER else 1.0) * rms > largest:
         lines.append(
-            'no arm is so far off: check units and columns of the measurements (--length, '
-            '--joint-angle, --columns), their rows, the robot, whether the device (--new-base) or '
-            'the target (--new-tool) was moved'
+            'no arm is that far off: check the units and columns of the measurements (--length, '
+            '--joint-angle, --columns), their rows, the robot, and whether the device '
+            '(--new-base) or the target (--new-tool) was moved'
         )
     elif found.common < NEARER:
         lines.append(
@@ -213,7 +213,7 @@ def _odd_in_words(found: Verification) -> str:
     far = 1e3 * norms(found.comparison.after.position[np.isin(found.group, found.odd)]).max()
     return (
         f'{names} {rounded(far)} mm off; the others are within the limit: measure again; if the '
-        'error stays, find what moved, was changed or was hit; an arm may also be worse in a part '
+        'error stays, find out what moved, changed or was hit; an arm may also be worse in part '
         'of its range'
     )
 

@@ -165,9 +165,9 @@ def still_holds(updated: Recalibration, found: Judgement) -> tuple[bool, str]:
     if updated.changed:
         reasons = changes_in_words(updated.changed)
         return False, (
-            f'the calibration in use no longer fits, {reasons}: was it, the target or the device '
-            f'bumped? {text}; call ~/clear, measure 8 poses or more, ~/identify, or run calib_ros '
-            'identify --previous'
+            f'the calibration in use no longer fits, {reasons}: was the robot, the target or the '
+            f'device bumped? {text}; call ~/clear, measure 8 poses or more, and call ~/identify '
+            'or run calib_ros identify --previous'
         )
     if updated.unexplained <= FALSE_ALARM:
         return False, (

@@ -178,7 +178,7 @@ class Guide:
 
     def _corrected_by(self, message: Any, calibration: Calibration | None) -> tuple[Any, str]:
         if calibration is None:
-            raise InputError('no accepted calibration can correct it: call ~/identify or ~/load')
+            raise InputError('there is no accepted calibration: call ~/identify or ~/load')
         compensator = _compensator(self._session.chain, calibration)
         robot = dict(zip(self._session.joint_names, self._session.chain.joint_names, strict=True))
         names = [robot.get(name, name) for name in message.joint_names]

@@ -315,4 +315,4 @@ def _forecast(estimate: Estimate, settings: Settings) -> str:
     more = estimate.more_for(wanted)
     if more > settings.pose_buffer:
         return f'{1e3 * wanted:g} mm is out of reach: are units, sigmas and wanted_accuracy right?'
-    return f'{more} more expected for {1e3 * wanted:g} mm'
+    return f'about {more} more for {1e3 * wanted:g} mm'

@@ -234,10 +234,10 @@ def test_units_are_named_though_a_common_motion_would_take_most_of_the_error(arm
     far = with_errors(arm, 30.0 + np.random.default_rng(0).normal(scale=0.1, size=(9, 3)))
     text = in_words(found := verify(arm, [far], 1e-3))
     assert found.common < 0.1
-    assert 'no arm is so far off' in text
+    assert 'no arm is that far off' in text
     assert 'was the measuring device moved' not in text
     coarse = with_errors(arm, np.random.default_rng(0).normal(scale=7e-3, size=(9, 3)))
-    assert 'no arm is so far off' not in in_words(verify(arm, [coarse], 1.5e-2))  # as wanted
+    assert 'no arm is that far off' not in in_words(verify(arm, [coarse], 1.5e-2))  # as wanted
 
 
 def test_one_pose_that_alone_exceeds_the_limit_is_named(arm):

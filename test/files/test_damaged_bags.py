@@ -137,7 +137,7 @@ def test_the_log_beside_a_database_is_read_and_left_as_it_is(tmp_path, long_bags
     log = path / f'{file.name}-wal'
     log.chmod(0o644)
     log.write_bytes(b'\0' + log.read_bytes()[1:])
-    with pytest.raises(InputError, match='wal is damaged, what was recorded last cannot be read'):
+    with pytest.raises(InputError, match='wal is damaged, so the last messages cannot be read'):
         session_of(path / file.name if alone else path)
 
 

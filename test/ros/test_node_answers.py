@@ -264,7 +264,7 @@ def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recor
         assert 'RMS 3.0' in broken.message
         bumped = cell.refused('check')
         assert 'no longer fits, changed: base' in bumped.message
-        assert ': was it, the target or the device bumped? RMS 3.0' in bumped.message
+        assert ': was the robot, the target or the device bumped? RMS 3.0' in bumped.message
     filed = {(row.kind, row.verdict): row for row in History(history).rows('7')}
     _, holds, broken = judged = [
         filed['validate', text] for text in ('no verdict', 'holds', 'does not hold')

@@ -110,7 +110,7 @@ def test_settings_change_at_run_time(cell, recording):
     wanted = {name: changes[name] for name in changes.keys() - {'marker_scale', 'fixed'}}
     assert cell.node.session.settings == Settings(**wanted, fixed=('elbow_joint.a',))
     told = cell.node.session.told  # another thread learns
-    cell.spin_until(lambda: 'more expected for 0.01 mm' in '; '.join(told()))
+    cell.spin_until(lambda: 'more for 0.01 mm' in '; '.join(told()))
     cell.done('identify')
     after = cell.node.session.calibration.chain
     assert after.table[2, 0] == load_chain('ur10e').table[2, 0] != before.table[2, 0]

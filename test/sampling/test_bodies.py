@@ -30,7 +30,7 @@ TEXTS = {
     'float32 quality\n',
     NAMED: 'std_msgs/Header header\nNamedPose[] poses\n',
 }
-UNREADABLE = f'defines {MOCAP} by what cannot be read'
+UNREADABLE = f'the definition of {MOCAP} in the bag cannot be read'
 for name, text in TEXTS.items():
     TYPESTORE.register(get_types_from_msg(text, name))
 

@@ -76,7 +76,7 @@ def test_the_status_tells_how_far_it_is():
     made.change(replace(made.settings, wanted_accuracy=1e-2))
     assert 'enough for the accuracy wanted' in made.status()
     made.change(replace(made.settings, wanted_accuracy=2e-6))
-    assert 'more expected for 0.002 mm' in made.status()
+    assert 'more for 0.002 mm' in made.status()
     made.change(replace(made.settings, wanted_accuracy=1e-8))  # or positions in mm
     assert made.status().endswith(
         'expected, 1e-05 mm is out of reach: are units, sigmas and wanted_accuracy right?'
@@ -97,9 +97,9 @@ def test_no_forecast_where_what_is_left_is_not_noise(rng, model, advice):
     assert re.search(rf'{re.escape(advice)} will not help: what is left is 1\d x', made.status())
     assert 'expected for' not in made.status()
     made.change(replace(made.settings, sigma_position=1e-3))  # it is the noise of the device
-    assert 'more expected for 0.1 mm' in made.status()
+    assert 'more for 0.1 mm' in made.status()
     as_noisy = session([replace(each, spread=1e-3) for each in given], loss='none', model=model)
-    assert 'more expected for 0.1 mm' in as_noisy.status()
+    assert 'more for 0.1 mm' in as_noisy.status()
 
 
 def test_no_accuracy_is_expected_of_positions_in_millimetres():
