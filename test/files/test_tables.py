@@ -150,7 +150,7 @@ FAULTS = [
     *((f'stamp_ns,q1,q2,x,y,z\n{each},0,0,1,2,3\n', 'line 2: stamp_ns must be an integer')
       for each in ('²', '9223372036854775808', '9' * 5000, '1.5', '--1', '"1,000"')),
     ('q1,q2,q1,x,y,z\n0,0,0,1,2,3\n', 'several columns q1'),
-    (f'{POINTS}0,0,1,2,3,4\n', 'line 4: more values than the 5 columns'),
+    (f'{POINTS}0,0,1,2,3,,4\n', 'line 4: more values than the 5 columns'),
     (f'{POINTS}{"0," * 600_000}\n', 'a line of more than 1000000 bytes'),
     (','.join(f'c{k}' for k in range(100_000)) + '\n1' * 100_000, '100000 columns'),
     ('q1,q2,x,y,z,device\n' + ''.join(f'0,0,1,2,3,d{k % 199}\n' for k in range(200)),
