@@ -317,6 +317,8 @@ class _Arm:
         for _ in range(4):  # changes of millimetres converge in two
             chain = self.chain.with_offsets(dict(zip(self.names, change, strict=True)))
             found = nuisance_products(chain, self.names, system, nuisances, most=system.count)
+            if not all(np.isfinite(part).all() for part in found):
+                raise np.linalg.LinAlgError('the new poses are too far off')
             products = found.reduced
             information = Information(self.names, *about_nominal(products[:-1], change))
             squares = float(products[-1, -1] + change @ (products[:-1, -1] + information.vector))
