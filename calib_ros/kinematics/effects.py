@@ -196,10 +196,13 @@ def _wave(
     highest, whole = int(orders.max()), (orders == np.round(orders)) & (orders > 0.0)
     if 2 * len(orders) <= highest or not whole.all():
         return np.asarray(np.exp(1j * orders[:, np.newaxis] * q))
-    turn = circles.setdefault(joint, np.exp(1j * q[np.newaxis]))
-    while len(turn) < highest:
-        circles[joint] = turn = np.concatenate([turn, turn * turn[-1]])
-    return np.asarray(circles[joint][orders.astype(int) - 1])
+    turn = circles.get(joint)
+    if turn is None or len(turn) < highest:
+        turn = circles[joint] = np.empty((highest, len(q)), dtype=np.complex128)
+        np.exp(1j * q, out=turn[0])
+        for row in range(1, highest):
+            np.multiply(turn[row - 1], turn[0], out=turn[row])
+    return np.asarray(turn[orders.astype(int) - 1])
 
 
 def couple_held(
