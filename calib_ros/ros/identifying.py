@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -14,10 +15,12 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
+from calib_ros.apply.confidence import interval_of, judge
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
 from calib_ros.errors import LONGEST, ConfigError, InputError, shortened, trouble
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.history import History
@@ -37,6 +40,7 @@ from calib_ros.sampling.account import too_much_lost
 from calib_ros.sampling.sample import Sample, named
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
+from calib_ros.shown import rounded, sentence
 
 
 class Filer:
@@ -89,6 +93,7 @@ class Snapshot(NamedTuple):
     origin: dict[str, Any]
     configuration: str
     cause: str  # what looks wrong in the messages and may explain a bad fit; empty if nothing
+    since: tuple[Calibration, list[Observations]] | None  # the calibration in use, and new poses
 
     def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
         """Return the operator's numbers of outlier samples."""
@@ -148,8 +153,11 @@ class Identifying:
         lost = tuple(too_much_lost(account, largest_loss)) if session.made else ()
         texts, owners = (session.warnings, str(account)), frames.owners
         loaded = Loaded(problem, asdict(account), *texts, refusals=lost, owners=owners)
-        cause = next((hint.text for hint in session.hints if hint.explains), '')
-        known = numbers, origin, self._configuration(), cause
+        cause = next((sentence(hint.text) for hint in session.hints if hint.explains), '')
+        since = None
+        with suppress(InputError):
+            since = session.since()
+        known = numbers, origin, self._configuration(), cause, since
         found = Snapshot(loaded, session.settings, samples, *known)
         self.progress.begin()
         return found
@@ -177,7 +185,8 @@ class Identifying:
         numbers = given.numbers_of(result.outliers)
         self.last = words.summary(result, numbers, loaded.warnings, first)
         hint = next(iter((*loaded.warnings, *words.other_remarks(result))), '')
-        self._advice = telling or first or hint
+        nearer = _nearer(result, given.since)
+        self._advice = telling or nearer or first or hint
         self.observability = words.observability_in_words(result)
         scale = self._node.get_parameter('marker_scale').value
         now = self._node.get_clock().now().to_msg()
@@ -191,7 +200,7 @@ class Identifying:
             published = Published(found.dump(), given.configuration, page)
             self._accepted(found, published, given.samples)
             self.earlier = ''
-            self.last += KEEP
+            self.last += f'; {nearer}' * bool(nearer) + KEEP
         else:
             self.earlier = ONE_BEFORE
             if self._session.calibration is not None:
@@ -239,6 +248,17 @@ class Identifying:
                 text = _without_middle(before, advice, room)
             text = ''.join((text, *kept, more))
         return success, text
+
+
+def _nearer(result: Identification, since: tuple[Calibration, list[Observations]] | None) -> str:
+    """Tell that the calibration before is clearly nearer to the poses measured since then."""
+    if since is None or result.validation is None or not result.accepted:
+        return ''
+    before, (now, _) = judge(*since, of_messages=True), interval_of(result.validation, 1)
+    if before.reused or before.upper >= now:
+        return ''
+    rms = rounded(1e3 * before.rms)
+    return f'the calibration before is nearer ({rms} mm): if saved, ~/load brings it back'
 
 
 def _without_middle(before: str, advice: str, longest: int) -> str:

@@ -253,7 +253,7 @@ def test_other_joints_and_names_of_the_robot_by_the_last_calibration(tmp_path, c
 def test_nothing_is_corrected_without_a_calibration(idle):
     corrected, logged = corrections(idle), idle.log()
     said = send(idle, trajectory(path(5)[0]))
-    assert 'refused: no accepted calibration' in said
+    assert 'refused: there is no accepted calibration' in said
     idle.spin_until(lambda: any(f'trajectory {said}' == each.msg for each in logged))
     assert not corrected
 

@@ -12,7 +12,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
-from ros_cell import PATIENCE, STOPS, Cell, topics, values_of
+from ros_cell import PATIENCE, STOPS, Cell, pose_messages, topics, values_of
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -91,6 +91,26 @@ def test_no_earlier_calibration_is_taken_for_the_one_that_is_identified(cell, re
     cell.spin_until(running.done)
     for name in ('save', 'export', 'load'):
         cell.done(name)
+
+
+def test_an_accepted_calibration_worse_than_the_one_in_use_is_told(cell, recording):
+    """With a length fixed that has an error, it replaced a better one without a word."""
+    cell.play(topics(recording))
+    cell.done('identify')
+    cell.done('save')
+    cell.done('clear')
+    said = 'the calibration before is nearer (0.0'
+    again = pose_messages(recording.poses)
+    for message in again:
+        message.pose.position.x += 1e-5
+    for fixed, worse in ((['wrist_1_joint.d'], True), (['shoulder_pan_joint.d'], False)):
+        cell.set_parameters({'fixed': fixed})
+        cell.play(topics(recording, measured_pose=again))
+        answer = cell.done('identify')
+        assert (said in answer.message) == worse
+        assert (said in cell.in_full(answer)) == worse
+        cell.done('load')
+        cell.done('clear')
 
 
 def test_messages_are_taken_while_a_judgement_is_filed(tmp_path, recording, monkeypatch):
