@@ -200,8 +200,8 @@ def place(
     reached = ~np.isnan(errors)
     if not reached.any():
         raise InputError(
-            f'at none of {len(grid)} placements does the arm reach all {len(task)} poses of the '
-            'task: check the unit (m), the orientation and the region, or use more cells'
+            f'the arm cannot reach all {len(task)} poses of the task in any of {len(grid)} '
+            'placements: check the unit (m), the orientation and the region, or use more cells'
         )
     away = np.linalg.norm(grid[:, :3] - grid[reached, :3].mean(axis=0), axis=1)
     centre = int(np.where(reached, away, np.inf).argmin())

@@ -138,7 +138,7 @@ def test_no_better_posture_is_missed(arm, rng):
 def test_a_task_out_of_reach_is_refused(arm):
     far = TASK.copy()
     far[0, 0, 3] = 10.0
-    with pytest.raises(InputError, match='reaches all 6 poses of the task at none'):
+    with pytest.raises(InputError, match='cannot reach all 6 poses of the task in any'):
         place(arm, far, cells=3)
     for x, said in ((0.2, 'give the lower corner first'), (np.nan, 'region must not hold NaN')):
         with pytest.raises(InputError, match=said):
