@@ -160,7 +160,7 @@ def _gain_refusals(
         text = 'the correction is not larger than its own uncertainty, even at the poses measured'
         if result.surprise:
             text += (
-                f': the held-out ones are {result.surprise:.1f} times further off than the fitted '
+                f': the held-out ones are {result.surprise:.3g} times further off than the fitted '
                 'ones lead to expect'
             )
         if not sized:

@@ -191,7 +191,7 @@ def _motion(problem: Problem, result: Identification) -> str:
 def _held_out_excess(result: Identification) -> str:
     """Return that held-out positions are further off than noise and expected errors make them."""
     return bool(result.surprise) * (
-        f'held-out poses are {result.surprise:.1f} times further off than the fitted ones lead to '
+        f'held-out poses are {result.surprise:.3g} times further off than the fitted ones lead to '
         'expect (stated errors are larger accordingly): are device, target and arm the same, '
         'unmoved and true to scale?'
     )
