@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
-from calib_ros.apply.confidence import interval_of, judge
+from calib_ros.apply.confidence import interval_of
+from calib_ros.decision.comparison import compare
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
@@ -254,10 +255,11 @@ def _nearer(result: Identification, since: tuple[Calibration, list[Observations]
     """Tell that the calibration before is clearly nearer to the poses measured since then."""
     if since is None or result.validation is None or not result.accepted:
         return ''
-    before, (now, _) = judge(*since, of_messages=True), interval_of(result.validation, 1)
-    if before.reused or before.upper >= now:
+    arm, sets = since
+    before = compare(arm.before, arm.chain, sets)
+    if arm.reused(sets) or interval_of(before, 1)[1] >= interval_of(result.validation, 1)[0]:
         return ''
-    rms = rounded(1e3 * before.rms)
+    rms = rounded(before.figures[1].rms_mm)
     return f'the calibration before is nearer ({rms} mm): if saved, ~/load brings it back'
 
 
