@@ -156,7 +156,13 @@ def _gain_refusals(
     elif scaled and not result.surprise:
         printed = all(each.pixels is not None for each in problem.sets)
         yield Reason(Rule.SCALE, out_of_scale(scaled, printed))
-    elif result.region is None or (result.surprise and before.rms_mm < ALIKE * after.rms_mm):
+    elif result.region is not None and result.surprise and before.rms_mm < ALIKE * after.rms_mm:
+        yield Reason(
+            Rule.REGION,
+            f'the held-out poses are {result.surprise:.3g} times further off than the fitted ones '
+            'lead to expect, and the correction lowers their error by less than a third',
+        )
+    elif result.region is None:
         text = 'the correction is not larger than its own uncertainty, even at the poses measured'
         if result.surprise:
             text += (

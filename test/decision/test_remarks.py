@@ -272,6 +272,7 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
         (3e-4, 1.0, []),
         (1e-3, 1.0, []),
         (1e-3, 5.0, []),
+        (3e-3, 1.0, [Rule.REGION]),
         (4e-3, 1.0, [Rule.REGION]),
     ],
 )
@@ -288,6 +289,8 @@ def test_held_out_poses_that_contradict_widen_all_errors_stated(slip, finer, rul
     sigmas = {name: sigma / finer for name, sigma in SIGMAS.items()}
     result = identify(Problem(UR, measured, [held], **sigmas))
     assert [each.rule for each in result.refusals] == rules
+    for each in result.refusals:  # not that it is less than its uncertainty, with a region
+        assert ('by less than a third' in each) == (result.region is not None)
     noise, found = 1e3 * np.sqrt(3.0) * given[0], result.validation.figures[1].rms_mm
     squares = result.pose_covariance(unseen)[:, :3, :3]
     expected = 1e3 * np.sqrt(np.trace(squares, axis1=1, axis2=2).mean())

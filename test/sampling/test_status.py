@@ -95,7 +95,7 @@ def test_no_forecast_where_what_is_left_is_not_noise(rng, model, advice):
     ]
     made = session(given, loss='none', model=model)
     assert re.search(rf'{re.escape(advice)} will not help: what is left is 1\d x', made.status())
-    assert 'expected for' not in made.status()
+    assert ' more for ' not in made.status()
     made.change(replace(made.settings, sigma_position=1e-3))  # it is the noise of the device
     assert 'more for 0.1 mm' in made.status()
     as_noisy = session([replace(each, spread=1e-3) for each in given], loss='none', model=model)
