@@ -16,6 +16,8 @@ from calib_ros.files.layouts import Expression, Layout, layout_of, load_layout
 from calib_ros.kinematics.chain import Joint
 from calib_ros.kinematics.chain_file import load_chain, shared_files
 
+FOUR = 'a,1,0,0\nb,2,0,0\nc,3,0,0\nd,4,0,0\n'
+
 
 def test_later_columns_may_use_our_names_of_earlier_ones():
     """As messages about a wrong setting name them."""
@@ -305,11 +307,7 @@ def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_h
         ('No,At,x,y,z\n1,a,1,0,0\n2,b,2,0,0\n', 'No,At,q1\n1,b,2\n2,a,1\n', ''),
         ('Target,x,y,z\na,1,0,0\nb,2,0,0\na,1,0,0\nb,2,0,0\n', 'At,q1\nb,2\na,1\n', ''),
         ('Point,x,y,z\na,1,0,0\na,1,0,0\nb,2,0,0\n', 'At,q1\nb,2\nc,9\na,1\n', ''),
-        (
-            'Point,x,y,z\na,1,0,0\n' + 'a,1,0,0\nb,2,0,0\nc,3,0,0\nd,4,0,0\n',
-            'At,q1\na,1\nb,2\nc,3\nd,4\n',
-            '"a"',
-        ),
+        (f'Point,x,y,z\na,1,0,0\n{FOUR}', 'At,q1\na,1\nb,2\nc,3\nd,4\n', '"a"'),
         ('Point,x,y,z\n' + 'a,1,0,0\n' * 4, 'At,q1\nb,2\nc,9\na,1\nd,8\n', ''),
         (
             'No,At,x,y,z\n1,a,1,0,0\n2,b,2,0,0\n3,c,3,0,0\n',
