@@ -11,6 +11,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.shown import moment
 
 FRAMES = ('base', 'tool')
+FROM_THERE = 'from there on'
 OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
 
 
@@ -54,6 +55,22 @@ class Step:
         return str(self.reason)
 
     @property
+    def outdated(self) -> bool:
+        """Tell whether the frame found is that before the step."""
+        return self.unused == FROM_THERE and not self.slow
+
+    @property
+    def _size(self) -> str:
+        return f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
+
+    def told(self, number: int) -> str:
+        """Return in short that a frame moved, for an operator of the node who counts poses so."""
+        moved = f'moved {self._size} before pose {number}'
+        if self.outdated:
+            return f'{self.what} is outdated: it {moved}, measure again after ~/clear'
+        return f'{self.what} {moved}'
+
+    @property
     def reason(self) -> Reason:
         """Return the reason to refuse a result."""
         where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
@@ -63,7 +80,7 @@ class Step:
             line = f'line {self.stamp_ns // 10**9}'
             where = line if self.image is None else f'{where}, {line}'
             when = 'if rows are in the order of measurement'
-        size = f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
+        size = self._size
         if self.held:
             off = f'the {self.what} held by the chain file is off {size}'
             return Reason(Rule.MISTAKE, f'{off}: correct it, or remove fixed: true there')
@@ -80,6 +97,7 @@ class Step:
             more += '; measure with one load, or fit only the poses before or only those after'
         if self.unused:
             more += f'; measurements {self.unused} carry no weight'
+            more += f': {self.what} is outdated, measure again' * self.outdated
         if self.apart:
             more += (
                 '; errors of the arm may look so, as poses before and after lie apart: mix them'

@@ -23,7 +23,7 @@ import numpy as np
 
 from calib_ros.decision.drift import slow_cosines
 from calib_ros.decision.imitations import LEAST, Imitation
-from calib_ros.decision.moved import FRAMES, Step, thing_of
+from calib_ros.decision.moved import FRAMES, FROM_THERE, Step, thing_of
 from calib_ros.decision.trials import largest_of
 from calib_ros.estimation.configurations import stops
 from calib_ros.estimation.fitted import Fitted
@@ -333,7 +333,7 @@ class _Scan:
             size, unit = turn, 'rad'
         weights = np.concatenate([self._weights[k] for k in group.sets])
         later = np.concatenate(after)
-        sides = ('before that', ~later), ('from there on', later)
+        sides = ('before that', ~later), (FROM_THERE, later)
         most = largest_of(problem) if unit == 'm' else problem.largest_angle
         joints = np.concatenate([each.joints for each in sets])
         unused = [where for where, side in sides if found.stop and not weights[side].any()]

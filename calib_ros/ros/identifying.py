@@ -18,6 +18,7 @@ from visualization_msgs.msg import MarkerArray
 from calib_ros.apply.confidence import interval_of
 from calib_ros.decision.comparison import compare
 from calib_ros.decision.misfits import Outlier
+from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
 from calib_ros.errors import LONGEST, ConfigError, InputError, shortened, trouble
@@ -96,10 +97,10 @@ class Snapshot(NamedTuple):
     cause: str  # what looks wrong in the messages and may explain a bad fit; empty if nothing
     since: tuple[Calibration, list[Observations]] | None  # the calibration in use, and new poses
 
-    def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
-        """Return the operator's numbers of outlier samples."""
-        of = [(each.base, each.tool) for each in self.loaded.problem.sets]
-        return {each: self.numbers[(each.stamp_ns, *of[each.set])] for each in outliers}
+    def number_of(self, one: Outlier | Step) -> int:
+        """Return the operator's number of an outlier, or of the first sample after a step."""
+        of = self.loaded.problem.sets[one.set]
+        return self.numbers[(one.stamp_ns, of.base, of.tool)]
 
 
 class Identifying:
@@ -183,11 +184,14 @@ class Identifying:
         steps = (step for reason in advice_of(result) for step in reason.steps)
         telling = next((each.short for each in result.refusals if each.rule in TELLING_RULES), '')
         first = next(steps, '') if telling else given.cause or next(steps, '')
-        numbers = given.numbers_of(result.outliers)
+        numbers = {each: given.number_of(each) for each in result.outliers}
         self.last = words.summary(result, numbers, loaded.warnings, first)
         hint = next(iter((*loaded.warnings, *words.other_remarks(result))), '')
-        nearer = _nearer(result, given.since)
-        self._advice = telling or nearer or first or hint
+        nearer, step = _nearer(result, given.since), result.step
+        moved = ''
+        if step and result.accepted and not step.slow:
+            moved = step.told(given.number_of(step))
+        self._advice = telling or moved or nearer or first or hint
         self.observability = words.observability_in_words(result)
         scale = self._node.get_parameter('marker_scale').value
         now = self._node.get_clock().now().to_msg()

@@ -6,6 +6,7 @@ import time
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from ros_cell import STOPS, Cell, joint_messages, pose_messages, topics, values_of
@@ -16,6 +17,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.files.archive import Archive
 from calib_ros.kinematics import se3
+from calib_ros.ros.identifying import ANSWER_LENGTH
 from calib_ros.sampling.session import CalibrationSession
 
 
@@ -51,6 +53,20 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
         cell.spin_until(lambda: words and f'; {STOPS} poses, 0.0' in words[-1].data)
         assert words[-1].data.startswith('the arm ')
         assert 'enough for the accuracy wanted' in words[-1].data
+
+
+@pytest.mark.parametrize('first', [8, 18])
+def test_an_answer_says_that_the_device_was_moved_meanwhile(cell, recording, first):
+    """It kept the last clause only: the base published was that of the place before."""
+    poses = pose_messages(recording.poses)
+    for message in poses[4 * first :]:
+        message.pose.position.x += 0.02
+    cell.play(topics(recording, measured_pose=poses))
+    answer = cell.done('identify').message
+    assert len(answer) <= ANSWER_LENGTH
+    moved = f'moved by 20 mm before pose {first + 1}'
+    old = f'base is outdated: it {moved}, measure again after ~/clear; to keep it call ~/save'
+    assert (old if 2 * first > STOPS else f'base {moved}') in answer
 
 
 def test_the_status_is_short_and_its_first_words_matter(monkeypatch, cell, recording):
