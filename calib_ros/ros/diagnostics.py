@@ -107,7 +107,7 @@ class Diagnostics:
             'held-out samples': account.held_out,
             'configurations': account.configurations,
             'journal': self._archive.journal or '',
-            'delay [s]': 'not known' if delay is None else f'{delay.seconds:.4f}',
+            'delay [s]': 'not known' if delay is None else f'{round(delay.seconds, 2) + 0.0:.2f}',
             **self._inputs.figures(),
             **{f'not used {cause}': count for cause, count in account.unused.items()},
             **{f'dropped {cause}': count for cause, count in account.dropped.items()},

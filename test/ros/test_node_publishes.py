@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from ros_cell import STOPS, Cell, joint_messages, pose_messages, topics, values_of
+from ros_cell import STOPS, Cell, joint_messages, part, pose_messages, topics, values_of
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
@@ -18,6 +18,7 @@ from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.files.archive import Archive
 from calib_ros.kinematics import se3
 from calib_ros.ros.identifying import ANSWER_LENGTH
+from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.session import CalibrationSession
 
 
@@ -53,6 +54,14 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
         cell.spin_until(lambda: words and f'; {STOPS} poses, 0.0' in words[-1].data)
         assert words[-1].data.startswith('the arm ')
         assert 'enough for the accuracy wanted' in words[-1].data
+
+
+def test_a_delay_is_told_no_finer_than_it_is_known(cell, recording, monkeypatch):
+    """Of positions at stops it was told as -0.0090 to -0.0160 s, though there was none."""
+    diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    monkeypatch.setattr(CalibrationSession, 'delay', Delay(-0.0049, 0.99))
+    cell.play(part(recording, 0.0, 1.0))
+    cell.spin_until(lambda: diagnostics and values_of(diagnostics[-1])['delay [s]'] == '0.00')
 
 
 @pytest.mark.parametrize('first', [8, 18])
