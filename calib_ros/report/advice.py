@@ -117,13 +117,19 @@ OUTLYING = (
     'these have in common?'
 )
 """First step if much is left, and it is not alike everywhere."""
+IN_BETWEEN = (
+    'The held-out poses do not fit the others: was the device, target or arm moved in between? '
+    'Then measure all again.'
+)
+"""First step if these were chosen, and are further off than expected."""
 
 
 @dataclass(frozen=True)
 class Situation:
     """Different poses, residual over stated noise, that noise [m], and what else is known.
 
-    Whether model is auto, poses share errors in succession only, and how many are outliers.
+    Whether model is auto, poses share errors in succession only, how many are outliers, and
+    whether chosen held-out poses are further off than expected.
     """
 
     poses: int = ENOUGH
@@ -132,6 +138,19 @@ class Situation:
     auto: bool = False
     drifts: bool = False
     outliers: int = 0
+    contradicted: bool = False
+
+    def first_of(self, rule: Rule) -> tuple[str, ...]:
+        """Return what to do before the steps of a rule."""
+        if rule in {Rule.GAIN, Rule.LARGEST_ERROR} and self.contradicted:
+            return (IN_BETWEEN,)
+        if rule is Rule.LARGEST_ERROR and self.outliers:
+            return (OUTLYING.format(self.outliers),)
+        if rule is Rule.GAIN and self.drifts:
+            return (DRIFTS,)
+        if rule is Rule.REGION and self.sigma and self.left * ALIKE < 1.0:
+            return (FINER.format(1e3 * self.sigma, 1e3 * self.left * self.sigma),)
+        return ()
 
     def said_of(self, one: Advice) -> Advice:
         """Return the advice on an unproven correction that suits the situation."""
@@ -169,13 +188,9 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
         refusal = replace(refusal, steps=tuple(steps))
         if rule in {Rule.GAIN, Rule.REGION}:
             refusal = situation.said_of(refusal)
-        first = []
-        if rule is Rule.LARGEST_ERROR and situation.outliers:
-            first = [OUTLYING.format(situation.outliers)]
-        if rule is Rule.GAIN and situation.drifts:
-            first, refusal = [DRIFTS], replace(refusal, again=rules()[Rule.DRIFT].again)
-        if rule is Rule.REGION and situation.sigma and situation.left * ALIKE < 1.0:
-            first = [FINER.format(1e3 * situation.sigma, 1e3 * situation.left * situation.sigma)]
+        first = situation.first_of(rule)
+        if DRIFTS in first:
+            refusal = replace(refusal, again=rules()[Rule.DRIFT].again)
         advised.append(replace(refusal, steps=(*first, *refusal.steps)))
     for cause, texts in following.items():
         heading = f'Likely consequences of "{rules()[cause].heading}"'

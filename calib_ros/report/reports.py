@@ -190,7 +190,8 @@ def advice_of(result: Identification) -> tuple[Advice, ...]:
     poses = sum(map(count_distinct, numbers))
     sigma = None if result.images else result.noise.given.get('sigma_position')
     auto, drifts = bool(result.verdicts), words.drifts(result.noise)
-    situation = Situation(poses, noise, sigma, auto, drifts, len(result.outliers))
+    contradicted = bool(held_out) and bool(result.surprise)
+    situation = Situation(poses, noise, sigma, auto, drifts, len(result.outliers), contradicted)
     return advice(result.refusals, situation)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from measured import UR, measured
+from measured import TRAIN, UR, measured
 from pages import page_of, report_of
 
 from calib_ros import Problem, identify, load_chain
@@ -15,6 +15,7 @@ from calib_ros.decision.mistakes import Diagnosis
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.undoing import Suspect
 from calib_ros.report import advice
+from calib_ros.report.reports import advice_of
 
 
 @pytest.mark.parametrize('auto', [False, True])
@@ -58,6 +59,18 @@ def test_outliers_are_to_be_looked_at_if_much_is_left():
     (told,) = advice.advice(refused, advice.Situation(outliers=12))
     assert '(12 poses; in the report' in told.steps[0]
     assert told.steps[1:] == advice.rules()[Rule.LARGEST_ERROR].steps
+
+
+@pytest.mark.parametrize('shift', [0.003, 0.02])
+def test_held_out_poses_further_off_ask_first_what_was_moved(shift):
+    """The chain was to be checked, or more poses to be measured."""
+    rows = measured()
+    train, test = rows.select(np.arange(TRAIN)), rows.select(np.arange(TRAIN, len(rows)))
+    test = replace(test, positions=test.positions + np.array([shift, 0.0, 0.0]))
+    result = identify(Problem(UR, train, held_out=test))
+    told = advice_of(result)[0]
+    assert told.steps[0] == advice.IN_BETWEEN
+    assert advice.IN_BETWEEN not in told.steps[1:]
 
 
 def test_errors_shared_in_succession_ask_for_random_order_first():
