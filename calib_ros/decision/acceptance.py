@@ -42,8 +42,7 @@ def refusals(
     the verdict of `rounding.py`, `sized` tells whether the measurements fix the size and shape of
     the arm, and `scaled` is the error of the device's scale if that alone leaves no region.
     """
-    failed = [*_fit_refusals(problem, result, own_behaviour)]
-    validation = result.validation
+    failed, validation = [*_fit_refusals(problem, result, own_behaviour)], result.validation
     if validation is None:
         count = len(np.unique(result.fitted.after.configurations))
         text = f'{count} different poses: too few to hold some out'
@@ -57,10 +56,10 @@ def refusals(
     gained = tuple(_gain_refusals(problem, result, validation, sized, scaled))
     before, after = validation.figures
     helps = after.rms_mm < before.rms_mm or all(each.rule is not Rule.GAIN for each in gained)
-    found = (*failed, *gained, *_harm_refusals(validation, may_be_rounding, helps))
-    # of a fit that explains nothing the parameters tell nothing
-    nothing = after.rms_mm > max(1e3 * problem.largest_error, before.rms_mm / ALIKE)
-    return tuple(sorted(found, key=lambda each: nothing and each.rule is Rule.COMMON_SENSE))
+    if after.rms_mm > max(1e3 * problem.largest_error, before.rms_mm / ALIKE):
+        # of a fit that explains nothing the parameters tell nothing
+        failed = [each for each in failed if each.rule is not Rule.COMMON_SENSE]
+    return (*failed, *gained, *_harm_refusals(validation, may_be_rounding, helps))
 
 
 def _fit_refusals(

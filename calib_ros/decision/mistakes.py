@@ -104,9 +104,7 @@ def with_mistake(problem: Problem, result: Identification) -> Identification:
     found, step = None, result.step
     if _suspicious(problem, result):
         if step and step.unused and fits_each_side(problem, problem.sets[step.set], step.stamp_ns):
-            rule = step.reason.rule
-            first = sorted(result.refusals, key=lambda each: each.rule is not rule)
-            return replace(result, refusals=tuple(first))
+            return result
         found = diagnose(problem)
     if found is None:
         return result

@@ -67,17 +67,15 @@ def add_remarks(problem: Problem, result: Identification, another: bool = True) 
     board = '' if lens else stretched(problem, result)
     sigmas, refusals = _sigmas(problem, result), [*result.refusals, *_scale(problem, result)]
     if board and all(each.pixels is not None for each in problem.sets):
-        refusals.insert(0, Reason(Rule.SCALE, board))
+        refusals.append(Reason(Rule.SCALE, board))
         board = ''
-    imitated = imitated or bool(lens and refusals)
-    if imitated:
-        refusals.insert(0, Reason(Rule.MISTAKE, lens))
+    if imitated or (lens and refusals):
+        refusals.append(Reason(Rule.MISTAKE, lens))
         lens = ''
     if another and (several := _sessions(problem, result)):
-        refusals.insert(0, Reason(Rule.MISTAKE, several))
-    if refusals and sigmas:
-        first = another and not imitated
-        refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
+        refusals.append(Reason(Rule.MISTAKE, several))
+    if sigmas and refusals:
+        refusals.append(Reason(Rule.MISTAKE, sigmas))
         sigmas = ''
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
     level, other = _level_hand(problem, result), _another_type(problem, result) if another else ''
@@ -228,7 +226,7 @@ def _lag(problem: Problem, result: Identification) -> Identification:
         return result
     text, other = found
     if other is not None and _imitated(other, result):
-        return replace(result, refusals=(Reason(Rule.LAG, text), *result.refusals))
+        return replace(result, refusals=(*result.refusals, Reason(Rule.LAG, text)))
     return replace(result, remarks=(*result.remarks, text))
 
 

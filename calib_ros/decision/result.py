@@ -63,7 +63,7 @@ class Identification(Shown):
     """Probability that drift of the device, shared by successive measurements, would let the arm's
     parameters explain as much. None for a target in sockets."""
     refusals: tuple[Reason, ...]
-    """Failed acceptance rules, in words; empty if the result is accepted."""
+    """Failed acceptance rules, in words, in the order of `Rule`; empty if accepted."""
     posterior: Posterior
     """The posterior of the arm, unmodelled effects included."""
     region: Region | None

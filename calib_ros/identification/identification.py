@@ -59,7 +59,9 @@ def identify(
     fit diverges; the message names the mistake that explains it, if any.
     """
     try:
-        return _identified(problem, simpler, progress)
+        result = _identified(problem, simpler, progress)
+        told = sorted(result.refusals, key=lambda each: each.rule.value)
+        return replace(result, refusals=tuple(told))
     except np.linalg.LinAlgError as err:
         if found := mistakes.diagnose(problem):
             raise InputError(f'the measurements do not fit the arm: {found}') from err

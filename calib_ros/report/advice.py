@@ -76,20 +76,21 @@ GOOD_HERE = replace(
 )
 """The same if the poses do not determine the error elsewhere."""
 
-WRONG_ARM = (Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR)
-"""Rules that fail if the description does not fit the arm."""
-WRONG = {*WRONG_ARM, Rule.CONVERGENCE, Rule.DRIFT, Rule.GAIN}
-WRONG |= {Rule.REGION, Rule.ORIENTATION, Rule.SCALE}
+UNSURE = {Rule.GAIN, Rule.REGION}
+WRONG = {*UNSURE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR, Rule.CONVERGENCE}
+WRONG |= {Rule.DRIFT, Rule.ORIENTATION, Rule.SCALE}
 """Consequences of a description that does not fit."""
-BRINGS = (
-    {Rule.CONFIGURATIONS: {Rule.ENCODER, Rule.MOVED}}
-    | dict.fromkeys(WRONG_ARM, WRONG)
-    | {rule: {rule, Rule.OUTLIERS, Rule.GAIN, Rule.REGION} for rule in (Rule.ENCODER, Rule.MOVED)}
-)
-BRINGS[Rule.LAG] = {*WRONG, Rule.OUTLIERS}
-BRINGS[Rule.MISTAKE] = {*WRONG, Rule.ENCODER, Rule.MOVED}
-BRINGS[Rule.EXCITATION] = {Rule.EXCITATION, Rule.GAIN, Rule.REGION}
-"""Consequences of each cause; the first cause present counts."""
+BRINGS = {
+    Rule.LAG: {*WRONG, Rule.OUTLIERS},
+    Rule.MISTAKE: {*WRONG, Rule.ENCODER, Rule.MOVED},
+    Rule.CONFIGURATIONS: {Rule.ENCODER, Rule.MOVED},
+    Rule.ENCODER: {*UNSURE, Rule.OUTLIERS},
+    Rule.MOVED: {*UNSURE, Rule.OUTLIERS},
+    Rule.EXCITATION: UNSURE,
+    Rule.COMMON_SENSE: WRONG,
+    Rule.LARGEST_ERROR: WRONG,
+}
+"""Consequences of each cause; the first cause told counts."""
 
 FAR = 1.0 / EXCEPTION
 """Ratio of residuals to stated noise that an arm's own errors rarely reach."""
@@ -174,7 +175,7 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
     advised: list[Advice] = []
     following: dict[Rule, list[Reason]] = {}
     for rule, texts in found.items():
-        causes = (each for each, brought in BRINGS.items() if each in found and rule in brought)
+        causes = (each for each in found if rule in BRINGS.get(each, ()))
         if (cause := next(causes, rule)) is not rule:
             following.setdefault(cause, []).extend(texts)
             continue
@@ -186,7 +187,7 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
         needless += ['publisher'] * ('publisher' not in refusal.refusal)
         steps = (each for each in refusal.steps if not any(word in each for word in needless))
         refusal = replace(refusal, steps=tuple(steps))
-        if rule in {Rule.GAIN, Rule.REGION}:
+        if rule in UNSURE:
             refusal = situation.said_of(refusal)
         first = situation.first_of(rule)
         if DRIFTS in first:

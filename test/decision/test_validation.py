@@ -112,16 +112,17 @@ def test_what_remains_is_told_as_precisely_as_its_limit(left, limit, said):
     [
         (3e-3, 1e-3, [Rule.CONVERGENCE, Rule.COMMON_SENSE]),
         (3e-3, 3e-3, [Rule.CONVERGENCE, Rule.COMMON_SENSE, Rule.GAIN]),
-        (0.016, 0.016, [Rule.CONVERGENCE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.COMMON_SENSE]),
+        (0.016, 0.016, [Rule.CONVERGENCE, Rule.LARGEST_ERROR, Rule.GAIN]),
         (0.04, 0.02, [Rule.CONVERGENCE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR]),
     ],
 )
-def test_parameters_of_a_fit_that_explains_nothing_are_told_last(rng, before, after, rules):
+def test_parameters_of_a_fit_that_explains_nothing_are_not_told(rng, before, after, rules):
     away = rng.normal(size=(40, 3)) / np.sqrt(3.0)
     given = {'converged': False, 'parameters': [row('a', 1.5, 0.01)]}
     found = refused(before * away, after * away, np.ones(40, dtype=bool), **given)
     assert [each.rule for each in found] == rules
-    assert str(found[rules.index(Rule.COMMON_SENSE)]).endswith('kind: elbow_joint.a by 1500 mm')
+    far = [each for each in found if each.rule is Rule.COMMON_SENSE]
+    assert all(each.endswith('kind: elbow_joint.a by 1500 mm') for each in far)
 
 
 @pytest.mark.parametrize(
