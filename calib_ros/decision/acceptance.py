@@ -158,16 +158,11 @@ def _gain_refusals(
     elif result.region is not None and result.surprise and before.rms_mm < ALIKE * after.rms_mm:
         yield Reason(
             Rule.REGION,
-            f'the held-out poses are {result.surprise:.3g} times further off than the fitted ones '
-            'lead to expect, and the correction lowers their error by less than a third',
+            f'{result.contradiction}, and the correction lowers their error by less than a third',
         )
     elif result.region is None:
         text = 'the correction is not larger than its own uncertainty, even at the poses measured'
-        if result.surprise:
-            text += (
-                f': the held-out ones are {result.surprise:.3g} times further off than the fitted '
-                'ones lead to expect'
-            )
+        text += f': {result.contradiction}' if result.surprise else ''
         if not sized:
             text += (
                 '; measure something that fixes the size and shape of the arm: positions, or two '

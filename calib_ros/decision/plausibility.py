@@ -53,6 +53,10 @@ COUPLED = (
     'couplings of the last joints explain most of the residuals: are the joint values those '
     'of the motors? If so, add the effects "coupling"'
 )
+UNEXPECTED = (
+    '(stated errors are larger accordingly): are device, target and arm the same, unmoved and '
+    'true to scale?'
+)
 
 
 def add_remarks(problem: Problem, result: Identification, another: bool = True) -> Identification:
@@ -79,7 +83,7 @@ def add_remarks(problem: Problem, result: Identification, another: bool = True) 
         sigmas = ''
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
     level, other = _level_hand(problem, result), _another_type(problem, result) if another else ''
-    judged = _held_out_excess(result) if another else ''
+    judged = f'{result.contradiction} {UNEXPECTED}' if another and result.contradiction else ''
     loose, order = loose_target(problem.sets), _order(problem)
     found = (other, lens, board, judged, coupled, level, loose, motion, order, sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
@@ -184,15 +188,6 @@ def _motion(problem: Problem, result: Identification) -> str:
                     'device or the joint states are smoothed. Stop at each pose (mode dwell)'
                 )
     return ''
-
-
-def _held_out_excess(result: Identification) -> str:
-    """Return that held-out positions are further off than noise and expected errors make them."""
-    return bool(result.surprise) * (
-        f'held-out poses are {result.surprise:.3g} times further off than the fitted ones lead to '
-        'expect (stated errors are larger accordingly): are device, target and arm the same, '
-        'unmoved and true to scale?'
-    )
 
 
 def _order(problem: Problem) -> str:

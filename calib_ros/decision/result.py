@@ -100,6 +100,14 @@ class Identification(Shown):
         return self.uncertainty.covariance
 
     @property
+    def contradiction(self) -> str:
+        """Return how far held-out poses are off, if clearly further than expected."""
+        return bool(self.surprise) * (
+            f'held-out poses are {self.surprise:.3g} times further off than the fitted ones lead '
+            'to expect'
+        )
+
+    @property
     def unidentifiable(self) -> tuple[str, ...]:
         """Return the parameters that were free but could not be determined."""
         return tuple(p.name for p in self.parameters if p.status in ('gauge', 'not excited'))

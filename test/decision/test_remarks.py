@@ -212,6 +212,7 @@ class Judged:
     refusals: tuple = ()
     remarks: tuple = ()
     coupled: bool = False
+    contradiction: str = ''
 
 
 @pytest.mark.parametrize(
@@ -245,7 +246,6 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
         '_sessions': found.get('sessions', ''),
         '_another_type': found.get('type', ''),
         '_level_hand': found.get('level', ''),
-        '_held_out_excess': found.get('unseen', ''),
         'loose_target': found.get('loose', ''),
         '_motion': found.get('motion', ''),
     }
@@ -257,11 +257,12 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
     given = tuple(Reason(Rule.GAIN, found[name]) for name in ('given',) if name in found)
     result = plausibility.add_remarks(
         SimpleNamespace(sets=[seen], separations=()),
-        Judged(given, ('first',), 'coupled' in found),
+        Judged(given, ('first',), 'coupled' in found, found.get('unseen', '')),
         another,
     )
     assert sorted(result.refusals, key=lambda each: each.rule.value) == refused
-    assert [e for e in result.remarks if e != plausibility.COUPLED] == ['first', *remarked]
+    said = [each.removesuffix(f' {plausibility.UNEXPECTED}') for each in result.remarks]
+    assert [each for each in said if each != plausibility.COUPLED] == ['first', *remarked]
     assert (plausibility.COUPLED in result.remarks) == ('coupled' in found)
 
 
