@@ -374,11 +374,8 @@ def _beam_search(problem: Problem, chain: Chain, given: Trial) -> Diagnosis | No
 
 
 def _merge_suspects(mistakes: Sequence[Suspect]) -> Suspect:
-    published = [f'{each.what} ({each.published})' for each in mistakes]
-    of_tables = [
-        setting if 'chain file' in each.published else f'{each.what} ({each.remedy})'
-        for each, setting in zip(mistakes, published, strict=True)
-    ]
+    of_tables = [f'{e.what} ({e.published if e.in_file else e.remedy})' for e in mistakes]
+    published = [f'{e.what} ({e.published})' for e in mistakes]
     what = 'several mistakes at once'
     return Suspect(what, '; '.join(of_tables), published='; '.join(published))
 

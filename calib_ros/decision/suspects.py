@@ -70,7 +70,7 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
     if of_images:
         yield from (replace(each, part='measured') for each in _of_boards(chain, sets[0]))
         for each in _arm_mistakes(chain):
-            remedy = each.published if 'chain' in each.published else 'correct it in --places'
+            remedy = each.published if each.in_file else 'correct it in --places'
             yield replace(each, remedy=remedy)
         return
     if not any(each.socket for each in sets):

@@ -38,6 +38,11 @@ class Suspect:
     published: str = 'correct the publisher and measure again (after ~/clear)'
     part: str = ''
 
+    @property
+    def in_file(self) -> bool:
+        """Tell whether the remedy for messages holds for tables too: it is in the chain file."""
+        return self.chain is not None or self.published in self.remedy
+
     def undo_in(self, sets: Sets) -> Sets:
         """Return the corrected samples."""
         for change in self.changes:

@@ -287,6 +287,17 @@ def test_the_size_of_a_board_is_told_as_it_is_stated(size, times, rng):
     assert 'convention: modified in the chain file' in {each.remedy for each in found}
 
 
+def test_what_is_wrong_in_the_chain_file_is_not_to_be_corrected_in_the_places(rng):
+    """Of images, lengths in mm and a frame held wrongly were sent there."""
+    arm = load_chain('ur10e')
+    seen = measure(arm, arm.random_joints(20, rng), rng)
+    long = [replace(j, a=1e3 * j.a, d=1e3 * j.d) for j in arm.joints]
+    wrong = replace(arm, joints=tuple(long), base=Frame(fixed=True))
+    remedies = {each.remedy for each in suspects(wrong, (seen,), of_images=True) if each.chain}
+    assert {'give metres there', 'correct it, or remove fixed: true there'} <= remedies
+    assert 'correct it in --places' not in remedies
+
+
 @pytest.mark.parametrize('seed', range(4))
 def test_a_board_that_is_seen_in_one_place_has_no_size(seed):
     rng, arm = np.random.default_rng(seed), load_chain('ur10e')
