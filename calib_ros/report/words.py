@@ -174,8 +174,8 @@ def still_holds(updated: Recalibration, found: Judgement) -> tuple[bool, str]:
             f'{text}, more than the calibration in use and noise explain; no change of a few '
             'parameters explains it: call ~/clear, measure new poses and call ~/identify'
         )
-    if found.limit is not None and found.failed:
-        return False, NO_LONGER_HOLDS.format(text, 1e3 * found.limit)
+    if found.failed:
+        return False, verdict_in_words(found)
     return True, f'the calibration in use agrees with the measurements: {text}'
 
 
@@ -190,11 +190,11 @@ def verdict_in_words(found: Judgement) -> str:
     if found.limit is None:
         told = f'no verdict, the calibration has no former error: {told}'
         return f'{told}; judge with calib_ros verify --tolerance'
+    told += f'; the limit is {1e3 * found.limit:.3f} mm'
     if found.failed:
-        return NO_LONGER_HOLDS.format(told, 1e3 * found.limit)
+        return f'the calibration no longer holds: {told}. Was tracker, target or robot moved?'
     if warning := reused_in_words(found.reused):
         return f'no verdict: {warning}: measure new ones; {text}'
-    told += f'; the limit is {1e3 * found.limit:.3f} mm'
     if found.verdict == 'UNDECIDED':
         return f'too few poses to tell whether the calibration holds: {told}; measure more'
     turned = turned_in_words(now)
@@ -212,10 +212,6 @@ def turned_in_words(figures: ErrorFigures) -> str:
     )
 
 
-NO_LONGER_HOLDS = (
-    'the calibration no longer holds: {}; the limit is {:.3f} mm. Was the tracker, target or '
-    'robot moved?'
-)
 BEFORE_IS = 'the nominal chain with its base and tool frames fitted to the same measurements'
 
 
