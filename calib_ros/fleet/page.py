@@ -80,9 +80,7 @@ def fleet_page(out: Path, found: Sequence[RobotStatus], done: Run) -> str | None
         states=STATES,
         counts={state: number for state, number in counts(found).items() if number},
         total=len(found),
-        alarmed=[each for each in shown if each.actions],
-        unreadable=[each for each in shown if each.errors],
-        remarked=[each for each in shown if each.remarks],
+        shown=shown,
         rows=[(each, _link(out, each)) for each in shown],
         done=done,
         script=PLOTLY,
@@ -107,7 +105,6 @@ def _chart(status: RobotStatus) -> dict[str, Any]:
     joints = dict.fromkeys(joint for night in nights for joint in night.strength)
     verified = status.verified[-MOST_NIGHTS:]
     return {
-        'serial': status.robot.serial,
         'tolerance': status.robot.tolerance,
         'time': times(night.row for night in nights),
         'rms': [night.row.rms_mm for night in nights],
