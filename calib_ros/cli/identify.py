@@ -54,7 +54,9 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         return _recalibrated(options, screen)
     filed = inputs.history_of(options)
     with common.output_files(options, (*RESULT_FILES, 'report.pdf')) as contents:
-        found = _identified(options, screen)
+        loaded = _loaded(options, screen)
+        read = (options.csv, options.detections, options.measured)
+        found = identified(options, screen, loaded, *read)
         if options.out is not None:
             contents |= result_files(found, screen, options.out, options.pdf)
     shown = () if found.result.accepted and not options.json else words.other_remarks(found.result)
@@ -79,7 +81,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
     with common.output_files(options, ('calibration.yaml', 'result.json', *REPORTS)) as contents:
-        loaded, _ = _loaded(options, screen)
+        loaded = _loaded(options, screen)
         if loaded.refusals:
             raise InputError('; '.join(loaded.refusals))
         common.at_least(options, growth=0)
@@ -154,17 +156,19 @@ def _intervals(judged: Comparison | None) -> str:
     return f'RMS {" -> ".join(likely)} mm' if all(likely) else ''
 
 
-def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
-    loaded, settings = _loaded(options, screen)
+def identified(
+    options: argparse.Namespace, screen: Screen, loaded: Loaded, *read: Path | None
+) -> Identified:
+    """Identify what was loaded from the files that were read."""
+    settings = common.settings_of(options)
     configuration = documents.configuration_yaml(options.chain, settings)
-    read = (options.csv, options.detections, options.measured)
     origin = inputs.origin_of(options, read, configuration)
     with screen.work('identifying') as work:
         result = loaded.identified(settings.model, work)
-    return Identified(loaded, result, origin, options.tolerance)
+    return Identified(loaded, result, origin, vars(options).get('tolerance'))
 
 
-def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settings]:
+def _loaded(options: argparse.Namespace, screen: Screen) -> Loaded:
     source = _source(options)
     posed = options.chain == boards.POSED
     chain = boards.posed_arm() if posed else load_chain(options.chain)
@@ -173,12 +177,12 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settin
     refuse_larger('sigma_touch', touch or 0.0, TOUCH_SIGMA)
     touched: dict[str, Any] = {} if touch is None else {'sigma_touch': touch}
     if options.detections is not None:
-        return _detected(options, chain, settings, touched, screen), settings
+        return _detected(options, chain, settings, touched, screen)
     if source == 'table':
         found = inputs.table_of(options, options.csv, chain, settings, screen, options.eye_in_hand)
-        return load_table(found, chain, settings, **touched), settings
+        return load_table(found, chain, settings, **touched)
     bag = inputs.replayed_bag(options.measured, chain, settings, screen)
-    return load_bag(*bag, options.largest_loss), settings
+    return load_bag(*bag, options.largest_loss)
 
 
 def _source(options: argparse.Namespace) -> str:

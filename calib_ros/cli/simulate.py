@@ -13,13 +13,13 @@ from calib_ros.apply.program import approaches
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.atomic import whole_folder, write_files
 from calib_ros.cli import common, inputs
-from calib_ros.cli.identify import RESULT_FILES, Identified, result_files, show
+from calib_ros.cli.identify import RESULT_FILES, identified, result_files, show
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import load_bag
 from calib_ros.files.recording import Recording, write_bag
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import chain_text, dump_chain, load_chain, parse_chain
-from calib_ros.report import documents, words
+from calib_ros.report import words
 from calib_ros.settings import Settings
 
 
@@ -30,7 +30,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _demo(options: argparse.Namespace, screen: Screen) -> int:
-    chain, settings = load_chain(options.chain), Settings()
+    chain = load_chain(options.chain)
     own = (*RESULT_FILES, 'bag_truth.yaml', 'bag/bag.*', 'bag/metadata.yaml')
     with whole_folder(options.out, own, overwrite=options.force) as folder:
         folder.mkdir()
@@ -38,12 +38,9 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         screen.say(f'1. simulating an arm with known errors: {options.out / "bag"}')
         truth = _write_simulation(chain, options, bag, screen)
         screen.say('2. reading the recording as if from a real cell')
-        loaded = load_bag(*inputs.replayed_bag(bag, chain, settings, screen))
+        loaded = load_bag(*inputs.replayed_bag(bag, chain, Settings(), screen))
         screen.say('3. identifying the errors')
-        configuration = documents.configuration_yaml(options.chain, settings)
-        origin = inputs.origin_of(options, [bag], configuration)
-        with screen.work('identifying') as work:
-            found = Identified(loaded, loaded.identified(settings.model, work), origin)
+        found = identified(options, screen, loaded, bag)
         screen.say('4. writing the report')
         contents = result_files(found, screen, options.out)
         write_files(folder, contents)

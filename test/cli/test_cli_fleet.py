@@ -110,7 +110,7 @@ def test_nights_that_no_file_keeps_are_filed_all_the_same(folder, monkeypatch):
     origin = json.loads(Path('out0/result.json').read_text())['origin']
     assert hashlib.sha256().hexdigest() not in json.dumps(origin)
 
-    identified, growing = identify._identified, Path('growing.csv')
+    identified, growing = identify.identified, Path('growing.csv')
     *rows, last = nights[0].read_text().splitlines(keepends=True)
     growing.write_text(''.join(rows))
 
@@ -120,7 +120,7 @@ def test_nights_that_no_file_keeps_are_filed_all_the_same(folder, monkeypatch):
         return found
 
     with monkeypatch.context() as patch:
-        patch.setattr(identify, '_identified', while_it_grows)
+        patch.setattr(identify, 'identified', while_it_grows)
         assert main(['identify', str(growing), *COMMON]) == 0
     assert [main(['identify', str(growing), *COMMON]) for _ in range(2)] == [0, 0]
     assert len(History('history').rows('0042')) == 4
