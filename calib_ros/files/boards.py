@@ -71,7 +71,7 @@ class Board:
     def corners(self) -> FloatArray:
         """Return the corners (M, 3) [m] by number."""
         if self.type == 'charuco':
-            flat = self.square * (_grid(self.columns - 1, self.rows - 1) + 1)
+            flat = self.square * (grid(self.columns - 1, self.rows - 1) + 1)
         else:
             flat = self.around_markers.reshape(-1, 2)
         return np.column_stack([flat, np.zeros(len(flat))])
@@ -79,7 +79,7 @@ class Board:
     @property
     def markers(self) -> FloatArray:
         """Return the upper left corners (K, 2) [m] of the markers by number."""
-        place = _grid(self.columns, self.rows)
+        place = grid(self.columns, self.rows)
         if self.type == 'markers':
             return np.asarray(self.square * place)
         white = place[place.sum(axis=1) % 2 == (0 if self.legacy_pattern else 1)]
@@ -103,7 +103,8 @@ class Board:
         return self.columns * self.square - less, self.rows * self.square - less
 
 
-def _grid(columns: int, rows: int) -> Index:
+def grid(columns: int, rows: int) -> Index:
+    """Return the column and row (N, 2) of each place of a grid, row by row."""
     return np.column_stack([each.ravel() for each in np.meshgrid(range(columns), range(rows))])
 
 

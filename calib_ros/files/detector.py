@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.files.boards import Board, Detections
+from calib_ros.files.boards import Board, Detections, grid
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.pictures import Flaw
@@ -82,9 +82,9 @@ def black_of(board: Board) -> FloatArray:
     """Return the black areas as rectangles (K, 4) [m]: left, top, width, height."""
     rows: list[tuple[float, float, float, float]] = []
     if board.type == 'charuco':
-        x, y = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
-        black = np.column_stack([x.ravel(), y.ravel()])[(x + y).ravel() % 2 == 0]
-        rows += [(board.square * i, board.square * j, *[board.square] * 2) for i, j in black]
+        place = grid(board.columns, board.rows)
+        black = board.square * place[place.sum(axis=1) % 2 == 0]
+        rows += [(x, y, board.square, board.square) for x, y in black.tolist()]
     for cells, (left, top) in zip(marker_cells(board), board.markers.tolist(), strict=True):
         size = board.marker / len(cells)
         for k, row in enumerate(cells):  # runs of black cells: no white lines between them
