@@ -3,11 +3,8 @@
   const data = JSON.parse(document.getElementById('data').textContent);
   const narrow = () => window.innerWidth < 600;
   const INK = '#1b1f24', BEFORE = '#d95f02', AFTER = '#1b9e77', OUT = '#b3261e';
-  let known;
-  const hasGL = () => {  // asked when it is needed: the first context takes a while
-    if (known === undefined) known = !!document.createElement('canvas').getContext('webgl');
-    return known;
-  };
+  let known;  // asked when it is needed: the first context takes a while
+  const hasGL = () => (known ??= !!document.createElement('canvas').getContext('webgl'));
   const plain = { displayModeBar: false, responsive: true };
   const base = () => ({
     font: { color: INK, family: 'system-ui, sans-serif', size: 13 }, autosize: true,
@@ -147,7 +144,7 @@
     ? { ...xyz(e.cells.position),
         text: e.cells.count.map((c, i) => `${c} ${e.things}, RMS ${fixed(e.cells.rms_before[i])} mm before, ${fixed(e.cells.rms_after[i])} mm after`) }
     : { ...at(good), text: good.map(words), customdata: good });
-  const [POINTS, OUTLIERS, VECTORS, ARM, AXES, PICKED] = [0, 1, 2, 3, 4, 7];
+  const [POINTS, VECTORS, ARM, AXES, PICKED] = [0, 2, 3, 4, 7];
 
   function drawSpace() {
     const [line, axes] = arm(state.picked < 0 ? Math.floor(count / 2) : state.picked);
@@ -256,13 +253,12 @@
   byId('only').parentElement.hidden = !outliers.length;
 
   // Errors over the session and against each joint
-  const names = e.kinds;
-  for (const [value, text] of names) byId('component').add(new Option(text, value));
+  for (const [value, text] of e.kinds) byId('component').add(new Option(text, value));
   const AXIS = { x: 0, y: 1, z: 2 };
   const value = (when, i) => (state.component === 'length' ? lengths[when][i]
     : state.component === 'angle' ? floats['turned_' + when][i]
       : floats[when][3 * i + AXIS[state.component]]);
-  const label = () => names.find(([v]) => v === state.component)[1];
+  const label = () => e.kinds.find(([v]) => v === state.component)[1];
   const first = () => Number(byId('alone').checked);
   function series(xs, key, axis) {
     if (e.bins) return bands(e.bins[key][state.component], axis);
