@@ -39,10 +39,7 @@ ONLY = {
     **dict.fromkeys(('dask', 'distributed'), ('fleet.',)),
     'rich': ('fleet.', 'cli.screen'),
     'argcomplete': ('cli.main',),
-    'yaml': (
-        *('texts', 'kinematics.chain_file', 'files.export', 'files.programs'),
-        *('files.vendors', 'ros.arguments'),
-    ),
+    'yaml': ('texts', 'ros.arguments'),
 }
 
 

@@ -21,6 +21,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from calib_ros.atomic import given_path
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.settings import EXCEPTION, STARTUP, Settings
@@ -225,7 +227,6 @@ def _files(command: Sequence[str]) -> list[str]:
 
 def _sections(command: Sequence[str]) -> list[tuple[str, list[str]]]:
     """Return the keys in parameter files, and the names of the parameters under each."""
-    import yaml
 
     def leaves(content: Mapping[str, Any], above: str) -> Iterator[str]:
         for key, below in content.items():
@@ -258,15 +259,11 @@ def refuse_unknown(command: Sequence[str], launch_file: str, known: Sequence[str
 
 def switched(given: Mapping[str, str], name: str) -> bool:
     """Return the value of a boolean launch argument."""
-    import yaml
-
     return bool(parse_like(False, yaml.safe_load(given[name]), f'launch argument "{name}"'))
 
 
 def rviz_config(text: str, namespace: str, fixed_frame: str = '') -> str:
     """Return an RViz configuration for the node in a namespace, and another fixed frame."""
-    import yaml
-
     document = yaml.safe_load(text)
     manager = document['Visualization Manager']
     above = ''.join(f'/{part}' for part in namespace.split('/') if part)
@@ -297,8 +294,6 @@ def _as_yaml(parameter: NodeParameter, text: str) -> str:
 
 
 def _value(parameter: NodeParameter, text: str) -> Any:
-    import yaml
-
     given: object = text
     with suppress(yaml.YAMLError):  # such as *.a=0.001, an alias without an anchor
         loaded = yaml.safe_load(text)
@@ -308,7 +303,5 @@ def _value(parameter: NodeParameter, text: str) -> Any:
 
 
 def _quoted(text: str) -> str:
-    import yaml
-
     quoted: str = yaml.safe_dump(text, default_style='"', allow_unicode=True, width=2**31)
     return quoted.strip()

@@ -204,19 +204,12 @@ class Inputs:
             )
         hearing = self._topics.setdefault(name, TopicState())
         hearing.latched = stream.still
-        events = SubscriptionEventCallbacks(
-            message_lost=lambda event: hearing.note_lost(event.total_count),
-            use_default_callbacks=False,  # reported by `_unheard`
-        )
         try:
-            subscription = self._node.create_subscription(
-                _message_type(stream.type),
-                stream.topic,
-                lambda data: None,  # no executor serves it
-                _qos(stream),
+            subscription = self._created(
+                stream,
+                stream.still,
+                lambda event: hearing.note_lost(event.total_count),
                 qos_overriding_options=QoSOverridingOptions(policies),
-                event_callbacks=events,
-                raw=True,
             )
         except RuntimeError as err:  # unknown policy
             raise ConfigError(f'qos_overrides for "{stream.topic}" cannot be: {err}') from err
@@ -234,15 +227,28 @@ class Inputs:
             infos = self._node.get_publishers_info_by_topic(topic)
             if TRANSIENT_LOCAL in (i.qos_profile.durability for i in infos):
                 self._not_latched.remove(stream)
-                subscription = self._node.create_subscription(
-                    _message_type(stream.type),
-                    stream.topic,
-                    lambda data: None,
-                    _qos(stream, latched=True),
-                    event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-                    raw=True,
-                )
+                subscription = self._created(stream, latched=True)
                 self._inputs[subscription] = stream, TopicState()  # the other one counts
+
+    def _created(
+        self, stream: Stream, latched: bool, lost: Callable[..., None] | None = None, **more: Any
+    ) -> Subscription:
+        """Subscribe without an executor and without warnings, as `_unheard` reports."""
+        return self._node.create_subscription(
+            _message_type(stream.type),
+            stream.topic,
+            lambda data: None,
+            QoSProfile(  # a new one each time, because overriding changes it
+                depth=IMAGE_QUEUE if stream.type in PICTURES else QUEUE,
+                reliability=RELIABLE if latched else BEST_EFFORT,
+                durability=TRANSIENT_LOCAL if latched else VOLATILE,
+            ),
+            event_callbacks=SubscriptionEventCallbacks(
+                message_lost=lost, use_default_callbacks=False
+            ),
+            raw=True,
+            **more,
+        )
 
     def _unheard(self) -> list[str]:
         """Return why publishers are not heard, by topic, even if others on it are."""
@@ -332,16 +338,6 @@ def _waiting(subscription: Subscription) -> list[tuple[dict[str, Any], Any]]:
                 break
             found.append((taken[1], taken[0]))
     return found
-
-
-def _qos(stream: Stream, latched: bool = False) -> QoSProfile:
-    """Return the QoS of a topic; a new one each time, because overriding changes it."""
-    latched = latched or stream.still
-    return QoSProfile(
-        depth=IMAGE_QUEUE if stream.type in PICTURES else QUEUE,
-        reliability=RELIABLE if latched else BEST_EFFORT,
-        durability=TRANSIENT_LOCAL if latched else VOLATILE,
-    )
 
 
 def _message_type(name: str) -> Any:
