@@ -24,7 +24,10 @@ from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.values import ROUNDED
 
-STEPS = (5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01]).tolist())
+STEPS = (
+    *(1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4),
+    *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01]).tolist(),
+)
 """Steps [rad or m] that values are rounded to; finer ones do no harm, wider ones are intended."""
 
 
