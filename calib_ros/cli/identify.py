@@ -88,8 +88,8 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         previous = inputs.calibration_of(
             options.previous, 'identify --previous', loaded.problem.chain
         )
-        serial = previous.serial_of(str(options.previous), options.serial)
-        known = {'robot_serial': serial} if serial else {}
+        options.serial = previous.serial_of(str(options.previous), options.serial)
+        known = {'robot_serial': options.serial} if options.serial else {}
         previous = replace(previous, record={**previous.record, **known})
         for warning in loaded.warnings:
             screen.warn(warning)

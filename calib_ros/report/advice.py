@@ -96,7 +96,7 @@ FAR = 1.0 / EXCEPTION
 """Ratio of residuals to stated noise that an arm's own errors rarely reach."""
 COARSE = (
     'The remaining error is {:.0f} times the stated device noise: check that target and device '
-    'sit firmly, the arm stood still, and the clocks agree.'
+    'sit firmly, the arm stood still, the clocks agree, and joint values have all their digits.'
 )
 """First check if the measurements are far too coarse."""
 FEW_POSES = 'Only {} different poses were measured: too few to be sure of anything about the arm.'

@@ -113,6 +113,9 @@ def test_the_calibration_of_another_serial_number_is_not_brought_up_to_date(
         status, _, told = run(*given, 'out', '--serial', serial)
         assert status == 1
         assert f'serial "0042"; this one is "{serial}"' in told
+    assert run(*given, 'out', '--out', 'again')[0] == 3  # the same poses
+    for name in ('report.md', 'report.html'):
+        assert '0042' in (tmp_path / 'again' / name).read_text()
 
 
 @pytest.mark.parametrize(('day', 'status'), [('2025-03-01', 0), ('2025-03-09', 1)])
