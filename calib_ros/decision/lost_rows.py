@@ -19,7 +19,7 @@ from calib_ros.decision.suspects import reordered, rows_away
 from calib_ros.decision.trials import in_frames, largest_of, sample_errors
 from calib_ros.decision.undoing import Sets, Suspect
 from calib_ros.estimation.configurations import count_distinct
-from calib_ros.estimation.levels import CONFIDENT, LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
+from calib_ros.estimation.levels import ALIKE, LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import flange
@@ -101,7 +101,7 @@ def other_order(
         return (Suspect(orders[best][0], remedy), errors[best]) if best else None
     steps = np.diff(np.column_stack([seen.joints, seen.given]), axis=0)
     one_way = steps.any(axis=0) & ((steps >= 0).all(axis=0) | (steps <= 0).all(axis=0))
-    if errors[0] < CONFIDENT * errors[best] or not one_way.any():
+    if ALIKE * errors[0] < min(errors[1:]) or not one_way.any():
         return None
     names = ', '.join(np.array([*nominal.joint_names, *'xyz'])[one_way])
     what = 'the joint values fit the measurements no better than in any other order of the rows'

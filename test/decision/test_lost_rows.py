@@ -101,6 +101,8 @@ def test_rows_of_joint_values_in_another_order_are_named(order, said, known, ori
 def test_rows_that_fit_are_in_no_other_order_nor_are_those_of_messages():
     *_, seen = measured_arm(1, 40, oriented=False)
     assert lost_rows.other_order(Problem(UR10E, seen), UR10E, seen, 5e-3) is None
+    swept = seen.select(np.argsort(seen.joints[:, 2]))
+    assert lost_rows.other_order(Problem(UR10E, swept), UR10E, swept, 1e-6) is None  # a worse arm
     mixed = replace(seen, joints=seen.joints[np.random.default_rng(1).permutation(40)])
     assert diagnose(Problem(UR10E, mixed)) is None
     assert (
