@@ -63,19 +63,25 @@ def find_step(fitted: Fitted, held: bool = False) -> Step | None:
             found = replace(found, size=2.0 * found.size, slow=True)  # the halves' means differ
         return scan.described(found)
     found = plain.imitated(fitted)
-    if found is not None and found.group.kind == 'joint' and fitted.robust.outliers.any():
-        plain = _Scan(fitted, loaded=False, gross=False)  # a slip leaves no gross errors
+    torn = found is not None and found.group.kind in FRAMES and plain.torn
+    if found is not None and not torn and fitted.robust.outliers.any():
+        plain = _Scan(fitted, loaded=False, gross=False)  # these gross errors are no move
         found = plain.imitated(fitted)
     step = None if found is None else plain.described(found)
     return step if step is not None and step.harmful else None  # else nothing was imitated
 
 
 def _searched(fitted: Fitted, loaded: bool, gross: bool = True) -> tuple[_Scan, _Found | None]:
-    """Return the linear model, with a constant load or without, and its best step."""
+    """Return the linear model, with a constant load or without, and its best step.
+
+    Gross errors may be the step, or hide it.
+    """
     scan = _Scan(fitted, loaded, gross)
     found = scan.best()
-    if gross and found is not None and scan.few_gross(found):
-        return _searched(fitted, loaded, gross=False)
+    if gross and fitted.robust.outliers.any() and (found is None or scan.few_gross(found)):
+        without = _searched(fitted, loaded, gross=False)
+        if found is not None or without[1] is not None:
+            return without
     return scan, found
 
 
@@ -250,13 +256,14 @@ class _Scan:
             gains = arm.gains(rows, own)
             k = int(np.argmax(gains))
             odds, size = arm.move_odds(rows[k], own[k])
-            if np.isfinite(odds) and first + k in self._torn():
+            if np.isfinite(odds) and first + k in self.torn:
                 odds = float(gains[k])
             if odds - trials > highest:
                 highest, found = odds - trials, _Found(group, int(first) + k, size, 1.0, 0.0)
         return found
 
-    def _torn(self) -> Sequence[int]:
+    @cached_property
+    def torn(self) -> Sequence[int]:
         """Return the ends of all gross errors if they follow each other: a side is torn off."""
         numbers, weights = np.concatenate(self._numbers), np.concatenate(self._weights)
         gross = np.setdiff1d(numbers, numbers[weights > 0.0])

@@ -22,15 +22,30 @@ COUNT, AT = 60, 26
 LINE = {'stamp_ns': 7 * 10**9, 'of_line': True}
 
 
-def bumped(errors=1.0, size=1e-3, noise=NOISE, **more):
-    """Return the fit of an arm of which the target moved by a size [m]."""
-    rng = np.random.default_rng(3)
+def bumped(errors=1.0, size=1e-3, noise=NOISE, seed=3, oriented=True, gross=0, **more):
+    """Return the fit of an arm of which the target moved by a size [m].
+
+    Some positions, anywhere in the session, are `gross`: off by centimetres.
+    """
+    rng = np.random.default_rng(seed)
     true = arm(rng, errors)
-    seen = measure(true, UR10E.random_joints(COUNT, rng), rng, *noise)
+    seen = measure(true, UR10E.random_joints(COUNT, rng), rng, *noise, oriented=oriented)
     late = np.arange(COUNT)[:, np.newaxis] >= AT
-    along = true.forward(seen.joints)[:, :3, 0]
-    seen = replace(seen, positions=seen.positions + size * late * along)
-    return fitting.fit(Problem(UR10E, seen, **SIGMAS, **more))
+    positions = seen.positions + size * late * true.forward(seen.joints)[:, :3, 0]
+    positions[rng.choice(COUNT, gross, replace=False)] += rng.normal(scale=0.03, size=(gross, 3))
+    return fitting.fit(Problem(UR10E, replace(seen, positions=positions), **SIGMAS, **more))
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_gross_errors_hide_no_step(seed):
+    """By Huber weights they are most of the squares, of which a step would explain too few."""
+    step = find_step(bumped(size=2e-3, seed=seed, oriented=False, gross=4))
+    assert (step.kind, step.sample) == ('tool', AT)
+
+
+@pytest.mark.parametrize('seed', [2, 5])
+def test_gross_errors_here_and_there_are_no_move_of_a_healthy_arm(seed):
+    assert find_step(bumped(0.0, 0.0, seed=seed, oriented=False, gross=4)) is None
 
 
 @pytest.mark.parametrize('count', [6, 30, 400])

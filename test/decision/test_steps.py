@@ -196,6 +196,17 @@ def test_half_of_the_session_called_outliers_hides_no_step():
     assert abs(result.step.sample - 30) <= 1
 
 
+@pytest.mark.parametrize('seed', [14, 17])
+def test_gross_errors_of_a_swept_arm_are_no_move(seed):
+    _, seen = session(seed, 'sweep', oriented=False)
+    rng = np.random.default_rng(seed)
+    rows, positions = rng.choice(COUNT, 4, replace=False), seen.positions.copy()
+    positions[rows] += rng.normal(scale=0.03, size=(4, 3))
+    result = identify(Problem(UR10E, replace(seen, positions=positions), **SIGMAS))
+    assert result.step is None
+    assert result.accepted
+
+
 def test_a_step_beside_the_fit_is_told_and_harms_nothing():
     true, seen = session(2)
     result = identify(Problem(UR10E, moved(seen, true, 'base', 0.02, at=45), **SIGMAS))
