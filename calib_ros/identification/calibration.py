@@ -224,15 +224,17 @@ class Calibration(Shown):
         """Return the largest RMS error [m] of new poses at which it still holds, None if unknown.
 
         ALIKE times its former error; if larger, ALIKE times the error expected at the poses of
-        `sets`, but no more than it removes there, or the error `rms_mm` of the nominal arm.
+        `sets`, but no more than it removes there, or the error `rms_mm` of the nominal arm. Those
+        in sockets are no further off: each is measured from its own place, as those held out.
         """
         if self.residual is None:
             return None
         former = ALIKE * self.residual
-        if not sets:
+        joints = [each.spread().joints for each in sets if not each.socket]
+        if not joints:
             return former
-        joints = np.concatenate([each.spread().joints for each in sets])
-        sizes = np.nan_to_num(self.sigma(joints)), self.removed(joints)[0]
+        q = np.concatenate(joints)
+        sizes = np.nan_to_num(self.sigma(q)), self.removed(q)[0]
         expected, removed = (float(np.sqrt(np.mean(each**2))) for each in sizes)
         return max(former, min(ALIKE * expected, removed, 1e-3 * rms_mm))
 

@@ -6,6 +6,7 @@ import re
 from copy import deepcopy
 from dataclasses import replace
 
+import in_sockets
 import numpy as np
 import pytest
 import yaml
@@ -13,6 +14,7 @@ import yaml
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.region import unpacked_matrix
 from calib_ros.errors import ConfigError
+from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration, load_calibration, parse_calibration
@@ -35,6 +37,13 @@ def found():
     owners = {'base': ('', False, False, 'tracker'), 'tool': ('', False, False, 'ball')}
     result = identify(Problem(UR, seen, effects=('gravity',), world_frame='tracker'))
     return Calibration.of(result, {'robot_serial': '7'}, owners)
+
+
+def test_in_sockets_it_holds_up_to_its_former_error():
+    """A joint off by 0.2 mm and 0.2 mrad was within a limit of 50 times that error."""
+    _, problem = in_sockets.cell(0, noise=1e-5, count=10)
+    found = Calibration.of(identify(problem))
+    assert found.limit(problem.sets, 2.0) == found.limit() == ALIKE * found.residual
 
 
 @pytest.fixture(scope='module')
