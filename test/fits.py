@@ -40,11 +40,11 @@ def arm(rng, errors=1.0, chain=UR10E):
     return faulty(chain, cell, np.random.default_rng(rng))
 
 
-def measured_arm(rng, count, noise=NOISE, **more):
-    """Return a generator, an arm with errors and poses of it; `rng` may be a seed."""
+def measured_arm(rng, count, noise=NOISE, chain=UR10E, errors=1.0, **more):
+    """Return a generator, an arm with errors as `arm` and poses of it; `rng` may be a seed."""
     rng = np.random.default_rng(rng)
-    true = arm(rng)
-    return rng, true, measure(true, UR10E.random_joints(count, rng), rng, *noise, **more)
+    true = arm(rng, errors, chain)
+    return rng, true, measure(true, chain.random_joints(count, rng), rng, *noise, **more)
 
 
 def problem(true, count, seed, oriented=True, chain=UR10E, worse=1.0):

@@ -40,6 +40,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
+from recorded import stamp_ns
 from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
@@ -291,11 +292,6 @@ def free_domain():
         else:
             return lock, domain
     raise AssertionError('no ROS domain is free')
-
-
-def stamp_ns(message):
-    message = getattr(message, 'transforms', [message])[0]
-    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
 
 def header(stamp_ns, frame_id=''):

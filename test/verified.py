@@ -5,24 +5,19 @@
 from dataclasses import replace
 
 import numpy as np
+from fits import NOISE, UR10E as UR, measured_arm
 
 from calib_ros.apply import simulation
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verdicts import each_in_words, likely_rms, remarks, verification_report
 
-UR = load_chain('ur10e')
-NOISE = (5e-5, 2e-4)
-
 
 def cell():
     """Return a true arm, its identification and what was fitted."""
-    rng = np.random.default_rng(0)
-    true = simulation.faulty(UR, simulation.Cell(), rng)
-    seen = simulation.measure(true, UR.random_joints(40, rng), rng, *NOISE)
+    _, true, seen = measured_arm(0, 40)
     return true, identify(Problem(UR, seen)), seen
 
 

@@ -12,7 +12,6 @@ from commanded import UR, UR_TRUE, regular
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.simulation import measure
 from calib_ros.cli.common import Status
-from calib_ros.cli.main import main
 from calib_ros.errors import InputError
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.programs import joints_csv, program_of, read_joints, read_program
@@ -41,18 +40,15 @@ def trajectory(q, names=UR.joint_names, **more):
 
 
 @pytest.fixture
-def run(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def run(run, tmp_path):
     (tmp_path / 'calibration.yaml').write_text(dump_chain(UR_TRUE, {'source': 'simulation'}))
 
-    def run(text, *arguments, suffix='.csv', chain='ur10e', out='out'):
+    def compensated(text, *arguments, suffix='.csv', chain='ur10e', out='out'):
         (tmp_path / f'program{suffix}').write_text(text)
-        capsys.readouterr()
         options = f'--chain {chain} --calibration calibration.yaml --out {out}{suffix}'.split()
-        status = main(['compensate', f'program{suffix}', *options, *map(str, arguments)])
-        return status, *capsys.readouterr()
+        return run('compensate', f'program{suffix}', *options, *arguments)
 
-    return run
+    return compensated
 
 
 @pytest.mark.parametrize('suffix', ['.csv', '.yaml'])

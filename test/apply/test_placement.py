@@ -4,9 +4,10 @@ from argparse import Namespace
 
 import numpy as np
 import pytest
+from fits import measured_arm
 
 from calib_ros import Calibration, Chain, Problem, identify
-from calib_ros.apply import simulation, workspace
+from calib_ros.apply import workspace
 from calib_ros.apply.workspace import in_base, place, task_of
 from calib_ros.cli.workspace import _task
 from calib_ros.errors import ConfigError, InputError
@@ -174,9 +175,7 @@ def test_an_arm_with_fewer_freedoms_than_a_pose_can_be_given_a_task(model):
         Joint('j4', d=0.05, lower=-2.6, upper=2.6),
     )
     nominal = Chain('scara', 'standard', rows)
-    rng = np.random.default_rng(3)
-    true = simulation.faulty(nominal, simulation.Cell(), rng)
-    seen = simulation.measure(true, nominal.random_joints(40, rng), rng, 5e-5, 2e-4)
+    *_, seen = measured_arm(3, 40, chain=nominal)
     arm = Calibration.of(identify(Problem(nominal, seen)))
     chain = arm.commanded_by(model)
     angles = np.arange(6) * np.pi / 3.0

@@ -130,9 +130,7 @@ def test_what_another_robot_leaves_is_never_accepted():
     """Seeded arms of another kind with the same number of joints, some of which fit by chance."""
     other, nominal = load_chain('franka_panda'), load_chain('kuka_iiwa14')
     for seed in (3, 16):
-        rng = np.random.default_rng(seed)
-        true = faulty(other, Cell(), rng)
-        seen = measure(true, other.random_joints(60, rng), rng, 5e-5, 2e-4)
+        *_, seen = measured_arm(seed, 60, chain=other)
         assert not identify(Problem(nominal, seen)).accepted
 
 
@@ -215,7 +213,7 @@ def test_a_chain_that_lists_the_wrong_axes_as_parallel_is_named(parallel, words)
 def test_rows_in_another_order_do_not_look_like_the_wrong_arm():
     """Whatever the parameters, the fit explains nothing: that comes first."""
     rng = np.random.default_rng(0)
-    seen = measure(faulty(UR10E, Cell(), rng), UR10E.random_joints(60, rng), rng, 5e-5, 2e-4)
+    *_, seen = measured_arm(rng, 60)
     result = identify(Problem(UR10E, replace(seen, joints=rng.permutation(seen.joints))))
     rules = [each.rule for each in result.refusals]
     assert rules[0] is Rule.LARGEST_ERROR

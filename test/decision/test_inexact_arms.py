@@ -4,12 +4,11 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
+from fits import measured_arm
 from scipy.spatial.transform import Rotation
 
 from calib_ros import Problem, load_chain
-from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.mistakes import diagnose
 
 ARM = load_chain('ur10e')
@@ -17,9 +16,7 @@ ARM = load_chain('ur10e')
 
 def seen_of(chain):
     """Poses of an arm off by 2 to 4 cm."""
-    rng = np.random.default_rng(1)
-    true = faulty(chain, Cell(length_error=5e-3, angle_error=1e-2), rng)
-    return measure(true, chain.random_joints(40, rng), rng, 1e-3, 1e-3)
+    return measured_arm(1, 40, (1e-3, 1e-3), chain, errors=10.0)[2]
 
 
 def as_vectors(each):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import UR10E as UR, measured_arm
 from scipy.spatial.transform import Rotation
 
 from calib_ros import Chain, Problem, identify, load_chain
@@ -17,13 +18,9 @@ from calib_ros.decision.undoing import mirrored, scaled
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame, Joint
 
-UR = load_chain('ur10e')
-
 
 def seen_of(chain=UR, seed=1, count=24, oriented=True):
-    rng = np.random.default_rng(seed)
-    true = faulty(chain, Cell(), rng)
-    return measure(true, chain.random_joints(count, rng), rng, 5e-5, 2e-4, oriented)
+    return measured_arm(seed, count, chain=chain, oriented=oriented)[2]
 
 
 def joints(change):
@@ -285,9 +282,7 @@ def test_a_chain_file_in_millimetres_is_named(b):
 @pytest.mark.parametrize(('stated', 'remarks'), [(0.1, 0), (0.01, 1)])
 def test_orientations_that_do_not_fit_are_a_remark_where_the_rest_is_accepted(stated, remarks):
     """Of a small target, say: 0.1 rad; nothing is said if that is what was stated."""
-    rng = np.random.default_rng(1)
-    true = faulty(UR, Cell(), rng)
-    seen = measure(true, UR.random_joints(40, rng), rng, 5e-5, 0.1)
+    *_, seen = measured_arm(1, 40, (5e-5, 0.1))
     found = identify(Problem(UR, seen, sigma_position=5e-5, sigma_orientation=stated))
     assert found.accepted
     assert len([each for each in found.remarks if 'orientations do not' in each]) == remarks
@@ -308,9 +303,7 @@ def test_a_mistake_of_one_of_two_devices_is_named_with_its_frame(held):
 
 
 def test_large_errors_of_an_arm_are_no_mistake():
-    rng = np.random.default_rng(0)
-    true = faulty(UR, Cell(5e-3, 1e-2), rng)
-    seen = measure(true, UR.random_joints(40, rng), rng, 5e-5, oriented=False)
+    *_, seen = measured_arm(0, 40, errors=10.0, oriented=False)
     assert identify(Problem(UR, seen)).accepted
 
 

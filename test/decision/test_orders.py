@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS
+from fits import SIGMAS, UR10E, measured_arm
 
 from calib_ros import identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -62,11 +62,10 @@ def test_swapped_ends_of_a_short_arm_are_named_once():
 
 
 def test_messages_from_the_flange_in_millimetres_are_named_with_the_setting_and_the_rest():
-    arm, rng = load_chain('ur10e'), np.random.default_rng(1)
-    seen = measure(faulty(arm, Cell(), rng), arm.random_joints(40, rng), rng, 5e-5, 2e-4)
+    *_, seen = measured_arm(1, 40)
     turned = replace(seen.inverted(), inverse=False)
     wrong = replace(turned, positions=1e3 * turned.positions)
-    said = str(diagnose(Problem(arm, wrong, of_messages=True)))
+    said = str(diagnose(Problem(UR10E, wrong, of_messages=True)))
     assert 'set eye_in_hand=true in sources, correct the rest in the publisher' in said
 
 
@@ -92,13 +91,12 @@ def test_rows_that_are_not_like_the_others_are_named():
 
 def test_a_few_rows_of_a_camera_on_the_flange_with_other_quaternions_are_named():
     """As they were measured, before they are inverted."""
-    arm, rng = load_chain('ur10e'), np.random.default_rng(2)
-    seen = measure(faulty(arm, Cell(), rng), arm.random_joints(40, rng), rng, 5e-5, 2e-4)
+    *_, seen = measured_arm(2, 40)
     given = replace(seen.inverted(), inverse=False)
     read = se3.from_quat(np.roll(se3.to_quat(given.rotations), 1, axis=1))
     some = np.isin(np.arange(40), [5, 6, 7])[:, np.newaxis, np.newaxis]
     spoilt = replace(given, rotations=np.where(some, read, given.rotations)).inverted()
-    found = str(diagnose(Problem(arm, spoilt)))
+    found = str(diagnose(Problem(UR10E, spoilt)))
     assert found.startswith('in lines 6 to 8 alone, the quaternions are w x y z, not x y z w')
 
 
@@ -131,11 +129,10 @@ def test_a_few_rows_in_another_unit_are_named(rows, where, oriented):
 @pytest.mark.parametrize('oriented', [True, False])
 def test_rows_of_a_lost_target_are_gross_errors_only(rows, oriented):
     """Odd and even rows fit alone, but so do all but these: no two arms."""
-    arm, rng = load_chain('ur10e'), np.random.default_rng(1)
-    seen = measure(faulty(arm, Cell(), rng), arm.random_joints(60, rng), rng, *NOISE, oriented)
+    *_, seen = measured_arm(1, 60, oriented=oriented)
     positions = seen.positions.copy()
     positions[rows] = 0.0
-    result = identify(Problem(arm, replace(seen, positions=positions), **SIGMAS))
+    result = identify(Problem(UR10E, replace(seen, positions=positions), **SIGMAS))
     assert result.accepted
     assert len(result.outliers) == rows.stop - rows.start
 
@@ -191,10 +188,9 @@ def test_rows_are_not_told_apart_in_sockets_images_or_several_sets(change):
 @pytest.mark.parametrize('share', [0.99, 1.01])
 def test_an_arm_is_far_off_by_its_largest_errors_of_position_and_angle(share):
     """A third of the angle counts, by the lever."""
-    arm, rng = load_chain('ur10e'), np.random.default_rng(1)
-    seen = measure(faulty(arm, Cell(), rng), arm.random_joints(20, rng), rng, *NOISE)
-    problem = Problem(arm, replace(seen, joints=seen.joints * [1, 1, -1, 1, 1, 1]))
-    half = 0.5 * share * trials.in_frames(problem, arm, problem.sets).error
+    *_, seen = measured_arm(1, 20)
+    problem = Problem(UR10E, replace(seen, joints=seen.joints * [1, 1, -1, 1, 1, 1]))
+    half = 0.5 * share * trials.in_frames(problem, UR10E, problem.sets).error
     limits = {'largest_error': half, 'largest_angle': 3.0 * half / LEVER}
     assert (diagnose(replace(problem, **limits), far=True) is None) == (share > 1.0)
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E as UR, arm
+from fits import NOISE, SIGMAS, UR10E as UR, measured_arm
 
 from calib_ros.apply.simulation import measure
 from calib_ros.decision import plausibility
@@ -282,9 +282,8 @@ def test_held_out_poses_that_contradict_widen_all_errors_stated(slip, finer, rul
 
     By a finer device, 0.6 mm instead of 2.2 were refused: its scale was widened as well.
     """
-    rng, given = np.random.default_rng(3), [sigma / finer for sigma in NOISE]
-    true = arm(rng)
-    measured = measure(true, UR.random_joints(60, rng), rng, *given)
+    given = [sigma / finer for sigma in NOISE]
+    rng, true, measured = measured_arm(3, 60, given)
     unseen = UR.random_joints(40, rng)
     held = measure(true.with_offsets({'elbow_joint.theta': slip}), unseen, rng, *given)
     sigmas = {name: sigma / finer for name, sigma in SIGMAS.items()}

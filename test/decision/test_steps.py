@@ -307,12 +307,10 @@ def test_one_of_several_targets_and_sessions(rng):
 
 
 def test_distances_tell_a_step_as_well(rng):
-    true = faulty(UR10E, Cell(), rng)
-    q = UR10E.random_joints(160, rng)
-    seen = measure(true, q, rng, NOISE[0], oriented=False)
+    _, true, seen = measured_arm(rng, 160, oriented=False)
     seen = moved(seen, true, 'tool', 2e-3, at=70)
     far = np.linalg.norm(seen.positions, axis=1)
-    only = replace(Observations.from_arrays(q, np.zeros((160, 3))), distances=far)
+    only = replace(Observations.from_arrays(seen.joints, np.zeros((160, 3))), distances=far)
     step = identify(Problem(UR10E, only, **SIGMAS)).step
     assert step.kind == 'tool'
     assert abs(step.sample - 70) <= 1

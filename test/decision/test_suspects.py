@@ -9,7 +9,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
-from fits import SCARA
+from fits import SCARA, measured_arm
 
 from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -322,8 +322,7 @@ def test_a_wrong_sign_in_the_dh_table_is_named(kind, which, accepted, rng):
     arm = replace(puma, joints=tuple(own), name='own')
     rows = [replace(j, **{kind: -getattr(j, kind)}) if j.name in which else j for j in arm.joints]
     wrong = replace(arm, joints=tuple(rows), parallel=None)
-    true = faulty(arm, Cell(), rng)
-    seen = measure(true, arm.random_joints(24, rng), rng, 5e-5, 2e-4)
+    *_, seen = measured_arm(rng, 24, chain=arm)
     found = identify(Problem(wrong, seen))
     assert found.accepted == accepted
     said = found.remarks if accepted else found.refusals

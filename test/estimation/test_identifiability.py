@@ -180,11 +180,9 @@ def test_observability_indices_by_hand(diagonal, poses, o1, o2, o3, o4, o5, rng)
 
 
 def test_indices_of_a_problem_are_those_of_its_jacobian(rng):
-    true = faulty(UR10E, Cell(), rng)
-    q = UR10E.random_joints(30, rng)
-    seen = measure(true, q, rng, *NOISE)
+    *_, seen = measured_arm(rng, 30)
     result = identify(Problem(UR10E, seen, loss='none', **SIGMAS))
-    jacobian = ErrorModel(result.chain, result.names).jacobian(q)
+    jacobian = ErrorModel(result.chain, result.names).jacobian(seen.joints)
     jacobian = jacobian / np.repeat(NOISE, 3)[:, np.newaxis]
     singular = np.linalg.svd(jacobian.reshape(-1, result.rank), compute_uv=False)
     assert result.observability == pytest.approx(observability(np.diag(singular), 30), rel=1e-3)

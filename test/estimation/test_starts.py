@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import NOISE, SCARA, SIGMAS, UR10E, worst_prediction
+from fits import NOISE, SCARA, SIGMAS, UR10E, measured_arm, worst_prediction
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -238,15 +238,12 @@ def test_axes_that_are_hardly_parallel_put_no_tool_metres_away(seed):
 
 def test_distances_start_right_among_gross_errors_that_agree():
     """A third of them is 0.3 m too long; the rest fits to the arm's own errors."""
-    rng = np.random.default_rng(0)
-    true = faulty(UR10E, Cell(), rng)
-    q = UR10E.random_joints(120, rng)
-    seen = measure(true, q, rng, 5e-5, 2e-4, oriented=False)
+    *_, seen = measured_arm(0, 120, oriented=False)
     distances = np.linalg.norm(seen.positions, axis=1)
     distances[::3] += 0.3
     wires = replace(seen, distances=distances)
     found = start_frames(Problem(UR10E, wires))
-    left = np.linalg.norm(found.forward(q)[:, :3, 3], axis=1) - distances
+    left = np.linalg.norm(found.forward(seen.joints)[:, :3, 3], axis=1) - distances
     assert np.median(np.abs(left)) < 2e-3
     np.testing.assert_allclose(found.base.matrix[:3, :3], np.eye(3))  # no distance tells a turn
 

@@ -9,23 +9,20 @@ import numpy as np
 import pandas
 import pyarrow.dataset
 import pytest
+from fits import UR10E as CHAIN, measured_arm
 
-from calib_ros import Problem, Settings, identify, load_chain
+from calib_ros import Problem, Settings, identify
 from calib_ros.apply import simulation
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.history import History
 from calib_ros.files.rows import Filing, Row, result_row, samples_hash, settings_hash
 
-CHAIN = load_chain('ur10e')
 BEGIN = datetime(2026, 1, 31, 23, 30, 0, 123_456, timezone.utc)
 
 
 @pytest.fixture(scope='module')
 def result():
-    rng = np.random.default_rng(1)
-    true = simulation.faulty(CHAIN, simulation.Cell(), rng)
-    rows = simulation.measure(true, CHAIN.random_joints(30, rng), rng, 5e-5, 2e-4)
-    return identify(Problem(CHAIN, rows))
+    return identify(Problem(CHAIN, measured_arm(1, 30)[2]))
 
 
 def row(k=0, serial='SN 1/ö', **more):

@@ -10,8 +10,9 @@ import in_sockets
 import numpy as np
 import pytest
 import yaml
+from fits import UR10E as UR, measured_arm
 
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import measure
 from calib_ros.decision.region import unpacked_matrix
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.levels import ALIKE
@@ -25,15 +26,12 @@ from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.settings import Settings
 
-UR = load_chain('ur10e')
 OWNED = {'session': '', 'eye_in_hand': False, 'socket': False, 'label': ''}
 
 
 @pytest.fixture(scope='module')
 def found():
-    rng = np.random.default_rng(0)
-    true = faulty(UR, Cell(), rng)
-    seen = measure(true, UR.random_joints(40, rng), rng, 1e-4, 3e-4)
+    *_, seen = measured_arm(0, 40, (1e-4, 3e-4))
     owners = {'base': ('', False, False, 'tracker'), 'tool': ('', False, False, 'ball')}
     result = identify(Problem(UR, seen, effects=('gravity',), world_frame='tracker'))
     return Calibration.of(result, {'robot_serial': '7'}, owners)

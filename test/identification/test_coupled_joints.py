@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, rms
+from fits import NOISE, SIGMAS, measured_arm, rms
 from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, take
 from urdfs import SCARA, ZERO, Z, limits, reference_forward, written
 
@@ -231,9 +231,8 @@ def test_a_joint_that_never_moves_has_gauges(rng):
     arm = load_chain('kuka_iiwa14')
     third = replace(arm.joints[2], lower=0.3, upper=0.3)
     nominal = replace(arm, joints=(*arm.joints[:2], third, *arm.joints[3:]))
-    true = faulty(nominal, Cell(), rng)
-    q = nominal.random_joints(60, rng)
-    result = identify(Problem(nominal, measure(true, q, rng, *NOISE), **SIGMAS))
+    _, true, seen = measured_arm(rng, 60, chain=nominal)
+    result = identify(Problem(nominal, seen, **SIGMAS))
     assert result.accepted
     assert not result.not_excited
     assert result.region.whole

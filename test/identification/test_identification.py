@@ -10,7 +10,7 @@ from fits import UR10E, fitted, measured_arm, worst_prediction
 from hypothesis import given, settings, strategies as st
 from urdfs import UR10E_ORIGINS, ur10e
 
-from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Learned, Problem
@@ -46,8 +46,7 @@ def test_what_is_free_of_noise_gives_exact_predictions(joints, oriented, rank, s
     """Of a share of the poses the orientation is known."""
     rng = np.random.default_rng(seed)
     nominal = random_arm(rng, joints)
-    true = faulty(nominal, Cell(), rng)
-    seen = measure(true, nominal.random_joints(80, rng), rng)
+    _, true, seen = measured_arm(rng, 80, (0.0, 0.0), nominal)
     problem, shares = Problem(nominal, replace(seen, oriented=np.arange(80) < 80 * oriented)), []
     result = identify(problem, progress=shares.append)
     assert sorted(shares) == shares

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SCARA, SIGMAS, UR10E, problem, rms
+from fits import NOISE, SCARA, SIGMAS, UR10E, measured_arm, problem, rms
 from robots import DATA, needs_data
 
 from calib_ros import Calibration, Problem, identify, load_chain, read_table, recalibrate
@@ -25,14 +25,6 @@ Q = UR10E.random_joints(300, np.random.default_rng(99))
 def but(seen, **changed):
     """Return a problem with changed observations."""
     return replace(seen, observations=replace(seen.observations, **changed))
-
-
-@pytest.fixture(scope='module')
-def earlier():
-    """Return an arm, and its calibration as it is read from a file."""
-    true = faulty(UR10E, Cell(), np.random.default_rng(4))
-    text = Calibration.of(identify(problem(true, 60, 0))).dump()
-    return true, parse_calibration(text, 'earlier.yaml', UR10E)
 
 
 @pytest.mark.parametrize('joint', ['elbow_joint', 'wrist_2_joint'])
@@ -322,9 +314,8 @@ def test_what_is_needed_is_asked_for(earlier):
 
 def test_a_device_whose_place_was_given_may_be_moved(rng):
     """As new, it is no longer where the chain file holds it."""
-    true = faulty(UR10E, Cell(), rng)
+    _, true, seen = measured_arm(rng, 60)
     given = replace(UR10E, base=replace(true.base, fixed=True))
-    seen = measure(true, UR10E.random_joints(60, rng), rng, *NOISE)
     previous = Calibration.of(identify(Problem(given, seen, **SIGMAS)))
     now = replace(true, base=random_frame(rng, 1.0))
     few = measure(now, UR10E.random_joints(12, rng), rng, *NOISE)

@@ -7,19 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import UR10E, arm, problem
+from fits import UR10E, problem
 from measured import rows_of, write_csv
 
-from calib_ros import Calibration, identify
 from calib_ros.identification.calibration import parse_calibration
-
-
-@pytest.fixture(scope='module')
-def earlier():
-    """Return an arm, and its calibration as it is read from a file."""
-    true = arm(4)
-    text = Calibration.of(identify(problem(true, 60, 0))).dump()
-    return true, parse_calibration(text, 'earlier.yaml', UR10E)
 
 
 def test_the_command_writes_the_calibration_brought_up_to_date(earlier, run, tmp_path):
