@@ -60,17 +60,17 @@ class Account:
             text += f', {self.configurations} of them different'
         if self.waiting:
             text += f', {self.waiting} measurements waiting'
+        if self.foreign_names:  # all else follows from it, and would cut the names
+            return (
+                f'{text}; joint states never name {", ".join(self.never_named)}, but '
+                f'{", ".join(self.foreign_names)}: give the chain of this arm (--chain) or, if '
+                'only the names differ, set joint_names (--joint-names)'
+            )
         tables: tuple[Mapping[Any, int], ...] = (self.unused, self.dropped, self.notes)
         for label, counts in zip(('not used', 'dropped', 'note'), tables, strict=True):
             if counts:
                 parts = ', '.join(f'{count} x {cause}' for cause, count in counts.items())
                 text += f'; {label}: {parts}'
-        if self.foreign_names:
-            text += (
-                f'; joint states never name {", ".join(self.never_named)}, but '
-                f'{", ".join(self.foreign_names)}: give the chain of this arm (--chain) or, if '
-                'only the names differ, set joint_names (--joint-names)'
-            )
         return text
 
 

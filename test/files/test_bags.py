@@ -112,8 +112,14 @@ def test_joints_by_other_names(tmp_path):
     session, _ = session_of(path, joint_names=('r/a', 'r/b', 'r/c'))
     np.testing.assert_array_equal(session.problem().observations.joints, [[1.0, 2.0, 3.0]])
     said = 'joint states never name a, b, c, but r/a, r/b, r/c: give the chain'
-    with pytest.raises(InputError, match=f'no poses to fit: .*2 x joints: none of .*; {said}'):
+    with pytest.raises(InputError, match=f'no poses to fit: .* gave 0 poses; {said}'):
         session_of(path)[0].problem()
+    names = [f'{part}_joint' for part in ('elbow', 'lift', 'pan', 'wrist_1', 'wrist_2', 'wrist_3')]
+    names = [f'left_shoulder_{name}' for name in names]
+    joints = [joint_state(k * MS, tuple(6 * [0.1 * k]), names) for k in (10, 20)]
+    others = [*(('/joint_states', message) for message in joints), events[2]]
+    with pytest.raises(InputError, match=f'but {", ".join(names)}: give the chain'):  # not cut
+        session_of(record(tmp_path / 'others', others))[0].problem()
 
 
 def test_of_several_topics_some_must_be_chosen(tmp_path):
