@@ -19,6 +19,14 @@ from calib_ros.kinematics.chain_file import load_chain, shared_files
 FOUR = 'a,1,0,0\nb,2,0,0\nc,3,0,0\nd,4,0,0\n'
 
 
+def read_beside(folder, points, log, **columns):
+    """Return the measurements, by target, of a table of points beside a log of one joint."""
+    (folder / 'points.csv').write_text(points)
+    (folder / 'log.csv').write_text(log)
+    given = Foreign(Layout(columns=columns), None, folder / 'log.csv')
+    return read_table(folder / 'points.csv', 1, foreign=given).fitted
+
+
 def test_later_columns_may_use_our_names_of_earlier_ones():
     """As messages about a wrong setting name them."""
     given = ['q*=J*', 'q1=q2,q2=q1', 'q2=q2-{q1},target=q1']
@@ -318,15 +326,12 @@ def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_h
 )
 def test_names_of_poses_need_no_column_of_the_same_name(tmp_path, points, log, odd):
     """Joint values of other poses were taken, row by row, without a word."""
-    (tmp_path / 'log.csv').write_text(log)
-    (tmp_path / 'points.csv').write_text(points)
     numbered = {'x': '#3', 'y': '#4', 'z': '#5'} if points.startswith('A') else {}
-    given = Foreign(Layout(columns=numbered), None, tmp_path / 'log.csv')
     if odd:
         with pytest.raises(InputError, match=f'{odd} of its column .* must be in one row'):
-            read_table(tmp_path / 'points.csv', 1, foreign=given)
+            read_beside(tmp_path, points, log, **numbered)
         return
-    (found,) = read_table(tmp_path / 'points.csv', 1, foreign=given).fitted
+    (found,) = read_beside(tmp_path, points, log, **numbered)
     assert found.joints[:, 0].tolist() == found.positions[:, 0].tolist()
 
 
@@ -338,35 +343,28 @@ def test_names_of_poses_need_no_column_of_the_same_name(tmp_path, points, log, o
 def test_numbers_of_poses_in_another_order_are_refused(tmp_path, ours, theirs, count, order):
     """Their rows were paired side by side."""
     named = f'{ours} 0' if ours == 'Point' else ''
-    rows = ''.join(f'{named}{k},{k},0,0\n' for k in order)
-    (tmp_path / 'points.csv').write_text(f'{ours},x,y,z\n{rows * count}')
-    rows = ''.join(f'{k},{k}\n' for k in (1, 2, 3, 4))
-    (tmp_path / 'log.csv').write_text(f'{theirs},q1\n{rows * count}')
-    given = Foreign(Layout(), None, tmp_path / 'log.csv')
+    points = f'{ours},x,y,z\n' + count * ''.join(f'{named}{k},{k},0,0\n' for k in order)
+    log = f'{theirs},q1\n' + count * ''.join(f'{k},{k}\n' for k in (1, 2, 3, 4))
     if order[0] != 1:
         with pytest.raises(InputError, match=f'the numbers in the column {ours} of .* come in an'):
-            read_table(tmp_path / 'points.csv', 1, foreign=given)
+            read_beside(tmp_path, points, log)
         return
-    (found,) = read_table(tmp_path / 'points.csv', 1, foreign=given).fitted
+    (found,) = read_beside(tmp_path, points, log)
     assert found.joints[:, 0].tolist() == found.positions[:, 0].tolist()
 
 
 def test_joint_values_and_coordinates_name_no_poses(tmp_path):
     """Whole degrees in another order than the numbers of the poses were refused."""
-    (tmp_path / 'points.csv').write_text('Nr,x,y,z\n1,2,9,0\n2,1,9,0\n3,4,9,0\n4,3,9,0\n')
-    (tmp_path / 'log.csv').write_text('Celsius,q1\n20,4\n22,3\n23,2\n21,1\n')
-    given = Foreign(Layout(), None, tmp_path / 'log.csv')
-    (found,) = read_table(tmp_path / 'points.csv', 1, foreign=given).fitted
+    points = 'Nr,x,y,z\n1,2,9,0\n2,1,9,0\n3,4,9,0\n4,3,9,0\n'
+    (found,) = read_beside(tmp_path, points, 'Celsius,q1\n20,4\n22,3\n23,2\n21,1\n')
     assert found.joints[:, 0].tolist() == [4.0, 3.0, 2.0, 1.0]
 
 
 def test_a_column_of_targets_that_was_given_is_read_beside_one_of_poses(tmp_path):
     """Where poses were matched by a column Target, both targets were taken for one."""
-    (tmp_path / 'log.csv').write_text('Target,q1\nP1,1\nP2,2\n')
-    points = 'Target,My probe,x,y,z\nP1,a 1,1,0,0\nP2,b 2,2,0,0\n'.replace(',', '\t')
-    (tmp_path / 'points.csv').write_text(points)  # the blanks separate nothing
-    given = Foreign(Layout(columns={'target': '{My probe}'}), None, tmp_path / 'log.csv')
-    found = read_table(tmp_path / 'points.csv', 1, foreign=given).fitted
+    points = 'Target,My probe,x,y,z\nP1,a 1,1,0,0\nP2,b 2,2,0,0\n'
+    points = points.replace(',', '\t')  # the blanks separate nothing
+    found = read_beside(tmp_path, points, 'Target,q1\nP1,1\nP2,2\n', target='{My probe}')
     assert [len(each) for each in found] == [1, 1]
 
 
