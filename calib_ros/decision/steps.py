@@ -209,7 +209,8 @@ class _Scan:
         vector = products[:, :, -1] - cross @ self._known
         lengths = np.einsum('bii->bi', own)
         found: _Found | None = None
-        lowest, (total, everything) = np.inf, self._all
+        lowest, (total, free) = np.inf, self._all
+        count, trials = free + self._fitted, self._stops * len(self._groups)
         for group in self._groups:
             columns = [self._added.index(name) for name in group.names]
             root = inverse_root(matrix[:, columns][:, :, columns], lengths[:, columns])
@@ -218,20 +219,18 @@ class _Scan:
             equations, freedom, left = self._budget(group)
             if left <= STEP_TOLERANCE**2 * equations or freedom <= rank.max() + 1.0:
                 continue
-            gain = (along**2).sum(axis=1)
-            share = np.minimum(gain / left, 1.0 - 1e-12)
-            k = int(np.argmax(share))
-            rest = (1.0 - share[k]) / (freedom - rank[k])
-            beyond = 1.0 - rest * freedom
-            # over all sets: one with few equations may have no freedom left
-            whole = everything - float(rank[k])
-            squares = float(gain[k]) * whole / max(total - float(gain[k]), 1e-300)
-            trials = self._stops * len(self._groups)
-            by_chance = trials * chance_of(squares, int(rank[k]), whole)
-            criterion = equations * np.log1p(-share[k]) + rank[k] * np.log(equations)
-            if beyond > least and by_chance < 1.0 - SURE and criterion < lowest:
+            gains = (along**2).sum(axis=1)
+            k = int(np.argmax(gains))
+            gain, degrees = float(gains[k]), int(rank[k])
+            share = 1.0 - max(1.0 - gain / left, 1e-12) * freedom / (freedom - degrees)
+            # a step in some sets spares the others too: steps compete by the squares of all
+            rest = max(total - gain, 1e-12 * total)
+            variance = rest / (free - degrees)
+            by_chance = trials * chance_of(gain / variance, degrees, free - degrees)
+            criterion = count * np.log(rest / total) + degrees * np.log(count)
+            if share > least and by_chance < 1.0 - SURE and criterion < lowest:
                 lowest, size = criterion, root[k] @ along[k]
-                found = _Found(group, int(places[k]), size, float(beyond), float(left * rest))
+                found = _Found(group, int(places[k]), size, share, variance)
         return found
 
     def imitated(self, fitted: Fitted) -> _Found | None:
@@ -314,8 +313,8 @@ class _Scan:
         ends = [*range(self._fitted), -1]
         matrix[np.ix_(ends, ends)] += self._given
         gain, rank, _ = gain_of(matrix, self._fitted)
-        _, freedom, left = self._budget(found.group)
-        return freedom > rank and (left - gain) / (freedom - rank) < found.variance
+        total, free = self._all
+        return free > rank and (total - gain) / (free - rank) < found.variance
 
     def described(self, found: _Found) -> Step:
         """Return a step with its first sample and its effect on the poses."""

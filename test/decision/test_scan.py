@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from fits import NOISE, SIGMAS, UR10E, arm, measured_arm
 
-from calib_ros import Problem, identify
+from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.decision import steps
 from calib_ros.decision.moved import Step
@@ -150,6 +150,26 @@ def test_sets_have_their_share_of_the_freedoms_of_the_fit():
     for group in scan._groups:
         equations, freedom, _ = scan._budget(group)
         assert (equations, freedom) == (6 * COUNT, pytest.approx(6 * COUNT - len(fitted.names)))
+
+
+@pytest.mark.parametrize('seed', [1, 5])
+def test_a_slip_that_one_of_several_sets_imitates_alone_is_that_of_the_joint(seed):
+    """Another anchor of one draw-wire spares the others too: more than all that its own lack."""
+    rng = np.random.default_rng(seed)
+    true, q = arm(rng), 0.15 * UR10E.random_joints(COUNT, rng) + [0.0, -1.0, 1.3, 0.0, 1.0, 0.0]
+    slipped = q.copy()
+    slipped[AT:, 2] += 2e-3
+    places = measure(true, slipped, rng, NOISE[0], oriented=False).positions
+    sets = []
+    for k, anchor in enumerate(rng.uniform(-2.0, 2.0, (3, 3))):
+        one = Observations.from_arrays(q[k::3], np.zeros((COUNT // 3, 3)))
+        far = np.linalg.norm(places[k::3] - anchor, axis=1)
+        one = replace(one.at(np.arange(k, COUNT, 3) * 10**9), base=f'base_{k}', distances=far)
+        sets.append(one)
+    chain = replace(UR10E, base=None)
+    step = find_step(fitting.fit(Problem(chain, sets[0], more=sets[1:], **SIGMAS)))
+    assert (step.what, step.stamp_ns // 10**9, step.slow) == ('elbow_joint', AT, False)
+    assert step.size == pytest.approx(2e-3, rel=0.1)
 
 
 @pytest.mark.parametrize('held', [False, True])
