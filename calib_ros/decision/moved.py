@@ -68,7 +68,7 @@ class Step:
         moved = f'moved {self._size} before pose {number}'
         if self.outdated:
             return f'{self.what} is outdated: it {moved}, measure again after ~/clear'
-        return f'{self.what} {moved}'
+        return f'{self.what} {moved}' + ', measure again after ~/clear' * self.harmful
 
     @property
     def reason(self) -> Reason:

@@ -18,7 +18,7 @@ from visualization_msgs.msg import MarkerArray
 from calib_ros.apply.confidence import interval_of
 from calib_ros.decision.comparison import compare
 from calib_ros.decision.misfits import Outlier
-from calib_ros.decision.moved import Step
+from calib_ros.decision.moved import FRAMES, Step
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
 from calib_ros.errors import LONGEST, ConfigError, InputError, shortened, trouble
@@ -187,10 +187,7 @@ class Identifying:
         numbers = {each: given.number_of(each) for each in result.outliers}
         self.last = words.summary(result, numbers, loaded.warnings, first)
         hint = next(iter((*loaded.warnings, *words.other_remarks(result))), '')
-        nearer, step = _nearer(result, given.since), result.step
-        moved = ''
-        if step and result.accepted and not step.slow:
-            moved = step.told(given.number_of(step))
+        moved, nearer = _moved(result, given), _nearer(result, given.since)
         self._advice = telling or moved or nearer or first or hint
         self.observability = words.observability_in_words(result)
         scale = self._node.get_parameter('marker_scale').value
@@ -253,6 +250,16 @@ class Identifying:
                 text = _without_middle(before, advice, room)
             text = ''.join((text, *kept, more))
         return success, text
+
+
+def _moved(result: Identification, given: Snapshot) -> str:
+    """Tell that a base or tool moved, if the result is accepted, or refused for that."""
+    step, refusals = result.step, result.refusals
+    if step is None or step.kind not in FRAMES or step.slow:
+        return ''
+    if refusals and (given.cause or refusals[0].rule is not Rule.MOVED):
+        return ''
+    return step.told(given.number_of(step))
 
 
 def _nearer(result: Identification, since: tuple[Calibration, list[Observations]] | None) -> str:

@@ -64,18 +64,24 @@ def test_a_delay_is_told_no_finer_than_it_is_known(cell, recording, monkeypatch)
     cell.spin_until(lambda: diagnostics and values_of(diagnostics[-1])['delay [s]'] == '0.00')
 
 
-@pytest.mark.parametrize('first', [8, 18])
-def test_an_answer_says_that_the_device_was_moved_meanwhile(cell, recording, first):
+@pytest.mark.parametrize(
+    ('first', 'said'),
+    [
+        (8, 'base {}; to keep it call ~/save'),
+        (12, 'base {}, measure again after ~/clear ... full text'),
+        (18, 'base is outdated: it {}, measure again after ~/clear; to keep it call ~/save'),
+    ],
+)
+def test_an_answer_says_that_the_device_was_moved_meanwhile(cell, recording, first, said):
     """It kept the last clause only: the base published was that of the place before."""
     poses = pose_messages(recording.poses)
     for message in poses[4 * first :]:
         message.pose.position.x += 0.02
     cell.play(topics(recording, measured_pose=poses))
-    answer = cell.done('identify').message
-    assert len(answer) <= ANSWER_LENGTH
-    moved = f'moved by 20 mm before pose {first + 1}'
-    old = f'base is outdated: it {moved}, measure again after ~/clear; to keep it call ~/save'
-    assert (old if 2 * first > STOPS else f'base {moved}') in answer
+    answer = cell.call('identify')
+    assert answer.success == (first != STOPS / 2)
+    assert len(answer.message) <= ANSWER_LENGTH
+    assert said.format(f'moved by 20 mm before pose {first + 1}') in answer.message
 
 
 def test_the_status_is_short_and_its_first_words_matter(monkeypatch, cell, recording):
