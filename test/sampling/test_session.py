@@ -45,6 +45,14 @@ def test_restored_samples_come_first_and_are_as_good_as_new():
         assert one == other
 
 
+def test_poses_that_only_judge_are_told_to_be_no_fit():
+    """Of a tracker on validation_pose it said only: 0 poses to fit and 12 held out."""
+    made = CalibrationSession(UR5E)
+    made.restore([replace(each, validation=True) for each in samples(12)])
+    with pytest.raises(InputError, match='all 12 came on topics for validation: measure'):
+        made.problem()
+
+
 @pytest.mark.parametrize(
     ('until', 'answer', 'kept'),
     [(0.8, (0, 'no measurement within this stop'), 1), (1.6, (1, ''), 2)],
