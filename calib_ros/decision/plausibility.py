@@ -31,7 +31,7 @@ from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, NEARER, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import SUSPICIOUS
+from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics import effects
@@ -322,12 +322,15 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
 
     They must explain most of the residuals, or more than chance if the arm imitates them: the arm
     fitted with them then differs by as much as it may be nearer to the nominal. The points of an
-    image share its pose, so each image counts for six freedoms.
+    image share its pose, so each image counts for six freedoms. Outliers tell nothing: towards the
+    plane of the camera, intrinsics move a point without bound.
     """
     if not result.converged or (result.step is not None and result.step.harmful):
         return '', False
     images: Counter[str] = Counter()
-    for each in problem.sets:
+    pairs = zip(problem.sets, result.distances, strict=True)
+    kept = problem.with_sets(each.select(far < OUTLIER) for each, far in pairs)
+    for each in kept.sets:
         if each.pixels is not None:
             images[each.camera] += count_distinct(each.images)
     for camera, count in images.items():
@@ -335,7 +338,7 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
         freedom = IN_A_FRAME * count - len(result.names)
         if frame.lens is None or not frame.lens.fixed or freedom <= len(names):
             continue
-        left = 1.0 - explained_share(problem, result.chain, result.names, names)
+        left = 1.0 - explained_share(kept, result.chain, result.names, names)
         rest = freedom - len(names)
         if chance_of((1.0 - left) / max(left, EXACT) * rest, len(names), rest) > 1.0 - SURE:
             continue

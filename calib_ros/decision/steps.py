@@ -31,6 +31,7 @@ from calib_ros.estimation.fitting import SOME
 from calib_ros.estimation.gain import gain_of, inverse_root
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
 from calib_ros.estimation.levels import LEAST_ASIDE, SURE, chance_of
+from calib_ros.estimation.pixels import in_view
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import SUSPICIOUS, weights_of
 from calib_ros.estimation.samples import gram
@@ -145,7 +146,10 @@ class _Scan:
         far = [d[index] for d, index in zip(robust.distances, self._chosen, strict=True)]
         self._weights = [weights_of(each, robust.loss) for each in far]
         bounded = 'huber' if gross and robust.loss != 'none' else robust.loss
-        few = robust.system.select(self._chosen).weighted([weights_of(d, bounded) for d in far])
+        few = robust.system.select(self._chosen)
+        seen = [in_view(self._chain, each.observations) for each in few.sets]
+        weights = (weights_of(each, bounded) for each in far)
+        few = few.weighted([w * each for w, each in zip(weights, seen, strict=True)])
         self._equations = np.array([float(samples.rows) for samples in few.sets])
         self._rows = few.rows_of(self._chain, self._names)
         self._sets = sets = [samples.observations for samples in few.sets]

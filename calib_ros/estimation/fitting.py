@@ -20,9 +20,10 @@ from calib_ros.estimation import identifiability
 from calib_ros.estimation.evidence import Inference
 from calib_ros.estimation.fitted import Fitted, SimplerFit
 from calib_ros.estimation.leastsquares import System, factor_of, minimise, triangular_factor
-from calib_ros.estimation.levels import CONFIDENT
+from calib_ros.estimation.levels import CONFIDENT, MOST_OUTLIERS
 from calib_ros.estimation.noise import Noise, noise_of, squares_of
 from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.pixels import in_view
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.robust import SUSPICIOUS, reweighted, thorough_fit
 from calib_ros.estimation.sizes import LEAST_SIZE, SETTLED, SPREAD
@@ -66,13 +67,19 @@ def _excited_names(
     priors = problem.prior_sigmas
     wanted = [n for n in problem.free if n in structural or n in priors]
     few, every = problem.system([each.spread(SOME) for each in problem.sets]), problem.sets
-    factor = factor_of(start, wanted, few)
+    factor = factor_of(start, wanted, _in_view(start, few))
     names = identifiability.excited(factor, wanted)
     if len(names) < len(wanted) and few.count < sum(map(len, every)):  # more may determine more
-        names = identifiability.excited(
-            triangular_factor(start, wanted, problem.system(every)), wanted
-        )
+        system = _in_view(start, problem.system(every))
+        names = identifiability.excited(triangular_factor(start, wanted, system), wanted)
     return names, np.asarray(np.linalg.qr(factor[:, np.isin(wanted, names)], mode='r'))
+
+
+def _in_view(start: Chain, system: System) -> System:
+    """Return a system without the few board points that a start sees far from where they are."""
+    kept = [in_view(start, each.observations) for each in system.sets]
+    most = 1.0 - np.concatenate(kept).mean() > MOST_OUTLIERS  # the start is wrong
+    return system if most else system.weighted([each.astype(float) for each in kept])
 
 
 def _fit_all(

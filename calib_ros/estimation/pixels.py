@@ -26,7 +26,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.lens import Projection, require_lens, view
 from calib_ros.kinematics.parameter import LENS_KINDS, parameters_of
-from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index, norms
 from calib_ros.values import LARGEST
 
 
@@ -180,6 +180,18 @@ def seen_residuals(chain: Chain, observations: Observations) -> Both:
         residual = np.clip(block.columns[-1], -LARGEST, LARGEST)
         pixels[block.part], shifts[block.part] = residual.T, block.seen.at_the_board(residual)
     return pixels, np.clip(shifts, -LARGEST, LARGEST)
+
+
+def in_view(chain: Chain, observations: Observations) -> Flags:
+    """Tell (N,) which points a chain sees within a focal length [px] of where they are.
+
+    Columns of others grow without bound towards the plane of the camera and behind it. All are
+    if nothing was measured in pixels.
+    """
+    if observations.pixels is None:
+        return np.ones(len(observations), dtype=bool)
+    lens = require_lens(chain.frame(observations.camera).lens, observations.camera)
+    return np.asarray(norms(seen_residuals(chain, observations)[0]) < lens.fx)
 
 
 def samples_of(

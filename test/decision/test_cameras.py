@@ -59,6 +59,20 @@ def test_intrinsics_that_the_arm_imitates_are_refused_though_they_explain_little
         assert any('--lens fitted' in each for each in result.refusals) == refused
 
 
+@pytest.mark.parametrize(('on_flange', 'seed'), [(True, 3), (True, 8), (False, 8)])
+def test_an_image_of_another_pose_is_an_outlier_and_says_nothing_else(on_flange, seed):
+    """Where the arm puts the board near the plane of the camera, pixels move without bound.
+
+    Other intrinsics explained it, it alone seemed to determine the arm, or the base to move.
+    """
+    seen, rng = images(on_flange, seed), np.random.default_rng(seed)
+    joints = seen.joints.copy()
+    joints[seen.images == 7] = seen.joints[seen.images == 11][0] + 0.3 * rng.normal(size=6)
+    result = identify(Problem(nominal(on_flange), replace(seen, joints=joints), sigma_pixel=0.1))
+    assert {seen.images[each.sample] for each in result.outliers} == {7}
+    assert (len(result.outliers), result.refusals, result.remarks) == (len(POINTS), (), ())
+
+
 @pytest.mark.parametrize('on_flange', [True, False])
 def test_a_board_that_is_stretched_is_refused(on_flange):
     """Printed 0.3 % wider it left 1.5 mm of 2.2 mm, where 0.24 mm were expected."""

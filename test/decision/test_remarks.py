@@ -197,11 +197,13 @@ def test_a_lens_explains_by_the_freedoms_of_the_images(share, change, told, monk
     monkeypatch.setattr(plausibility, 'explained_share', lambda *_: share)
     monkeypatch.setattr(plausibility, '_imitated', lambda *_: given['imitates'])
     lens = Lens(800.0, 800.0, 320.0, 240.0, fixed=given.get('fixed', True))
-    chain = UR.with_frame('camera', Frame(lens=lens))
-    seen = SimpleNamespace(pixels=1, camera='camera', images=np.arange(given['count']))
-    result = SimpleNamespace(**given, names=range(27), chain=chain)
-    sets = seen, SimpleNamespace(pixels=None)
-    found, imitates = plausibility._lens(Posed(sets, chain), result)
+    chain = UR.with_frame('tool', Frame(lens=lens))
+    rows = np.arange(given['count'] + 1)
+    nothing, far = np.zeros((len(rows), 6)), np.where(rows, 1.0, 7.0)  # one image is an outlier
+    seen = Observations.from_pixels(nothing, nothing[:, :2], nothing[:, :3], rows, True)
+    sets = seen, Observations.from_arrays(nothing, nothing[:, :3])
+    result = SimpleNamespace(**given, names=range(27), chain=chain, distances=(far, far))
+    found, imitates = plausibility._lens(Problem(chain, sets[0], more=sets[1:]), result)
     assert told in found
     assert bool(found) == bool(told)
     assert imitates == (bool(told) and given['imitates'])
