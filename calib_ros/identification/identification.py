@@ -200,7 +200,8 @@ def _weak(problem: Problem, parameters: Sequence[ParameterRow]) -> tuple[str, ..
     """Return the DH parameters that the poses determine less than the learned priors."""
     if problem.learned is None:
         return ()
-    learned = {n: x for n, x in problem.learned.priors.items() if n not in _priors(problem)}
+    known = _priors(problem)
+    learned = {n: x for n, x in problem.learned.priors.items() if n not in known}
     stds = [(p.name, p.std) for p in parameters if p.std is not None and p.name in learned]
     return tuple(name for name, std in stds if std**2 > 0.5 * learned[name] ** 2)
 
