@@ -183,15 +183,19 @@ class Inference:
     more: Sequence[str] = ()
     rounding: Mapping[str, float] = field(default_factory=dict)
 
+    @cached_property
+    def _without_waves(self) -> _Columns:
+        return _Columns(self)
+
     def likeliest(self) -> Posterior:
         """Return the posterior of what is fitted, for the most probable sizes alone."""
-        columns = _Columns(self)
+        columns = self._without_waves
         evidence = columns.evidence()
         return columns.posterior(evidence, evidence.most_probable(columns.considered)[0])
 
     def judging(self) -> Posterior:
         """Return the posterior averaged over plausible sizes, with the device, to judge an arm."""
-        columns = _Columns(self)
+        columns = self._without_waves
         evidence, sums = columns.evidence(), columns.sums
         size, slope = evidence.most_probable(columns.considered)
         near = evidence.sigma_points(size, slope)
@@ -208,7 +212,8 @@ class Inference:
 
         Its axes may wobble by the `unmodelled` waves, and the device may be out of scale.
         """
-        columns, fitted = _Columns(self, posterior.unmodelled.waves), self.fitted
+        waves, fitted = posterior.unmodelled.waves, self.fitted
+        columns = _Columns(self, waves) if waves else self._without_waves
         evidence, arm, considered = columns.evidence(), columns.arm, columns.considered
         size, slope = evidence.most_probable(considered)
         near = evidence.sigma_points(size, slope)
