@@ -36,7 +36,7 @@ ADVICE = (
 
 @dataclass(frozen=True)
 class Outlier:
-    """A sample with a gross error: its place, and its size in units of the usual error."""
+    """A sample with a gross error: its place, and its size in sigmas along one axis."""
 
     set: int
     sample: int

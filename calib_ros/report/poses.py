@@ -53,7 +53,7 @@ class Poses:
     in_sigma: FloatArray  # (N, 6) `after` in stated sigmas, position first; NaN: not measured
     role: NDArray[np.str_]  # FITTED, JUDGED or REPEATED
     outlier: Flags
-    size: FloatArray  # of the residual in usual errors; NaN where the pose was not fitted
+    size: FloatArray  # of the residual in sigmas along an axis; NaN if not fitted
     corner: Flags  # of a board in an image
     set: Index  # of observations, by its number
     tools: FloatArray  # (S, 4, 4) of the sets

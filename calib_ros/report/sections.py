@@ -140,7 +140,7 @@ def outliers(poses: Poses) -> Section:
         'They differ from the others by more than this arm and device explain: little or no '
         'weight in the fit, none in the figures. Measure them again, or find out what happened.'
         f'{more}',
-        head=('from', poses.things[:-1], 'times the usual error', 'error after [mm]'),
+        head=('from', poses.things[:-1], 'residual [sigma]', 'error after [mm]'),
         rows=tuple(
             (poses.source(k), str(k + 1), size, f'{after[k]:.3f}')
             for k in rows[:50].tolist()

@@ -208,7 +208,7 @@
     roles && ['used', (i) => e.roles[e.role[i]] + (e.outlier[i] ? ', outlier' : '')],
     e.oriented && ['before [mrad]', (i) => fixed(floats.turned_before[i])],
     e.oriented && ['after [mrad]', (i) => fixed(floats.turned_after[i])],
-    sized && ['times usual', (i) => fixed(floats.size[i], 1)],
+    sized && ['residual [sigma]', (i) => fixed(floats.size[i], 1)],
     ...e.joints.map((name, k) => [`${name} [${e.show[k][1]}]`, (i) => fixed(floats.joints[n * i + k] * e.show[k][0], e.show[k][2])]),
   ].filter(Boolean);
   const isNumber = ([title]) => !['from', 'used'].includes(title);
@@ -251,6 +251,7 @@
     headRow.append(th);
   }
   byId('only').parentElement.hidden = !outliers.length;
+  byId('sized').hidden = !sized;
 
   // Errors over the session and against each joint
   for (const [value, text] of e.kinds) byId('component').add(new Option(text, value));
