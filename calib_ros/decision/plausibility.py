@@ -293,6 +293,7 @@ def _sigmas(problem: Problem, result: Identification) -> str:
     )
     best, judged = 1e3 * EXCEPTION * TYPICAL['length'], result.validation
     computed = judged is not None and judged.figures[0].rms_mm < best
+    moved = result.step is not None and result.step.harmful  # and may have turned
     for k, (what, unit, size, most) in enumerate(kinds):
         if size is None:
             continue
@@ -309,7 +310,7 @@ def _sigmas(problem: Problem, result: Identification) -> str:
             if computed:
                 asked = 'no arm is as good: did its controller compute the poses?'
             found.append(f'{name}, and only {left}: {asked}')
-        elif k and size > CLEARLY * max(noise.position, 1.0) and size * given < most:
+        elif k and not moved and size > CLEARLY * max(noise.position, 1.0) and size * given < most:
             found.append(
                 f'{name}, but {left}: the orientations outweigh the positions and spoil them; set '
                 f'{"larger covariances" if own else f"sigma_orientation to {size * given:.2g}"}'

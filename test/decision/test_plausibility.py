@@ -16,6 +16,7 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.leastsquares import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Joint
+from calib_ros.kinematics.se3 import exp_rotation
 from calib_ros.settings import Settings
 
 UR = load_chain('ur10e')
@@ -163,6 +164,16 @@ def test_orientations_far_worse_than_their_sigma_are_named(turns):
     assert not any('sigma' in each for each in mended.remarks)
     q = UR.random_joints(300, rng)
     assert rms(mended.chain, true, q) < 0.4 * rms(result.chain, true, q)
+
+
+def test_a_target_that_turned_is_not_told_as_a_large_sigma():
+    """With the sigma told it was accepted."""
+    seen = seen_of(arm(0), count=40)
+    late, turn = np.arange(40) >= 20, exp_rotation(np.array([[0.0, 0.02, 0.0]]))[0]
+    turned = np.where(late[:, np.newaxis, np.newaxis], seen.rotations @ turn, seen.rotations)
+    result = identify(Problem(UR, replace(seen, rotations=turned), **SIGMAS))
+    assert result.refusals[0].rule is Rule.MOVED
+    assert 'sigma_orientation' not in ' '.join((*result.refusals, *result.remarks))
 
 
 def test_covariances_in_square_millimetres_are_named():
