@@ -57,7 +57,7 @@ class Step:
     @property
     def outdated(self) -> bool:
         """Tell whether the frame found is that before the step."""
-        return self.unused == FROM_THERE and not self.slow
+        return self.kind in FRAMES and self.unused == FROM_THERE and not self.slow
 
     @property
     def _size(self) -> str:

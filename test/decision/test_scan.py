@@ -36,6 +36,15 @@ def bumped(errors=1.0, size=1e-3, noise=NOISE, seed=3, oriented=True, gross=0, *
     return fitting.fit(Problem(UR10E, replace(seen, positions=positions), **SIGMAS, **more))
 
 
+def test_of_a_late_slip_no_joint_is_told_to_be_outdated():
+    """Only a frame that moved is."""
+    *_, seen = measured_arm(2, COUNT)
+    slipped = seen.joints + 0.05 * np.outer(np.arange(COUNT) >= 45, np.eye(6)[2])
+    step = find_step(fitting.fit(Problem(UR10E, replace(seen, joints=slipped), **SIGMAS)))
+    assert (step.kind, step.outdated) == ('joint', False)
+    assert 'measurements from there on carry no weight' in str(step)
+
+
 @pytest.mark.parametrize('seed', [0, 1])
 def test_gross_errors_hide_no_step(seed):
     """By Huber weights they are most of the squares, of which a step would explain too few."""
