@@ -112,6 +112,10 @@ def thing_of(kind: str, seen: Observations) -> str:
     of_images = seen.pixels is not None
     target = ['the board' if of_images else 'the target']
     device = ['the camera', 'its lens'] if of_images else ['the measuring device']
+    if seen.socket or seen.plane:
+        device = ['the socket' if seen.socket else 'the plane']
+    elif seen.distances is not None:
+        device += ['its zero']
     on_flange, other = (device, target) if seen.inverse or seen.on_flange else (target, device)
     *first, last = on_flange if kind == 'tool' else [*other, "the robot's foot"]
     return f'{", ".join(first)} or {last}' if first else last

@@ -11,7 +11,7 @@ from fits import NOISE, SIGMAS, UR10E, arm, measured_arm
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.decision import steps
-from calib_ros.decision.moved import Step
+from calib_ros.decision.moved import Step, thing_of
 from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
@@ -202,3 +202,16 @@ def test_places_are_apart_where_a_plane_explains_nearly_all_of_it(share, apart):
     rest = share * EXCEPTION * 6.0 / 7.0
     joints = np.sqrt(1.0 - rest) * (2.0 * after - 1.0) + np.sqrt(rest) * beside
     assert steps._separable(joints[:, np.newaxis], after) == apart
+
+
+@pytest.mark.parametrize(
+    ('changed', 'device'),
+    [
+        ({'socket': True}, 'the socket'),
+        ({'distances': np.ones(3)}, 'the measuring device, its zero'),
+        ({'distances': np.zeros(3), 'plane': True}, 'the plane'),
+    ],
+)
+def test_what_stands_beside_the_robot_is_named(changed, device):
+    seen = replace(Observations.from_arrays(np.zeros((3, 6)), np.zeros((3, 3))), **changed)
+    assert thing_of('base', seen) == f"{device} or the robot's foot"
