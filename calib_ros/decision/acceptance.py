@@ -25,7 +25,7 @@ from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, CONFIDENT, MOST
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags
 from calib_ros.settings import EXCEPTION
-from calib_ros.shown import some
+from calib_ros.shown import rounded, some
 
 
 def refusals(
@@ -134,8 +134,8 @@ def _gain_refusals(
     if after.rms_mm > largest and (before.rms_mm > largest or gain > limit):
         yield Reason(
             Rule.LARGEST_ERROR,
-            f'RMS {after.rms_mm:,.{1 if largest >= 1.0 else 3}f} mm remains on held-out poses, '
-            f'more than {largest:g} mm (largest_error)',
+            f'RMS {rounded(after.rms_mm)} mm remains on held-out poses, more than '
+            f'{largest:g} mm (largest_error)',
         )
     if not gain > limit:
         text = f'RMS {before.rms_mm:.3f} mm before, {after.rms_mm:.3f} mm after'

@@ -99,8 +99,8 @@ def refused(before, after, judged, largest_error=0.01, **change):
     return [*refusals(problem, result, None, False, True)]
 
 
-@pytest.mark.parametrize(('left', 'limit', 'said'), [(2e-5, 1e-5, '0.020'), (0.02, 0.01, '20.0')])
-def test_what_remains_is_told_as_precisely_as_its_limit(left, limit, said):
+@pytest.mark.parametrize(('left', 'limit', 'said'), [(2e-5, 1e-5, '0.020'), (2.0, 0.01, '2000')])
+def test_what_remains_is_told_as_in_the_table(left, limit, said):
     """It said: RMS 0.0 mm remains, more than 0.01 mm."""
     away = np.full((40, 3), left / np.sqrt(3.0))
     told = refused(2.0 * away, away, np.ones(40, dtype=bool), limit)
