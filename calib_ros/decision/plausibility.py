@@ -71,7 +71,7 @@ def add_remarks(problem: Problem, result: Identification, another: bool = True) 
     board = '' if lens else stretched(problem, result)
     sigmas, refusals = _sigmas(problem, result), [*result.refusals, *_scale(problem, result)]
     if board and all(each.pixels is not None for each in problem.sets):
-        refusals.append(Reason(Rule.SCALE, board))
+        refusals.insert(0, Reason(Rule.SCALE, board))  # before what follows for its size
         board = ''
     if imitated or (lens and refusals):
         refusals.append(Reason(Rule.MISTAKE, lens))

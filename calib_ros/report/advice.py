@@ -78,11 +78,12 @@ GOOD_HERE = replace(
 
 UNSURE = {Rule.GAIN, Rule.REGION}
 WRONG = {*UNSURE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR, Rule.CONVERGENCE}
-WRONG |= {Rule.DRIFT, Rule.ORIENTATION, Rule.SCALE}
+WRONG |= {Rule.DRIFT, Rule.ORIENTATION}
 """Consequences of a description that does not fit."""
 BRINGS = {
-    Rule.LAG: {*WRONG, Rule.OUTLIERS},
-    Rule.MISTAKE: {*WRONG, Rule.ENCODER, Rule.MOVED},
+    Rule.LAG: {*WRONG, Rule.SCALE, Rule.OUTLIERS},
+    Rule.MISTAKE: {*WRONG, Rule.SCALE, Rule.ENCODER, Rule.MOVED},
+    Rule.SCALE: WRONG,
     Rule.CONFIGURATIONS: {Rule.ENCODER, Rule.MOVED},
     Rule.ENCODER: {*UNSURE, Rule.OUTLIERS},
     Rule.MOVED: {*UNSURE, Rule.OUTLIERS},

@@ -226,6 +226,7 @@ class Judged:
         ({'lens': 'lens', 'given': 'gain', 'sigmas': 's'}, True, ['lens', 's', 'gain'], []),
         ({'board': 'board', 'sigmas': 'sigmas'}, True, [], ['board', 'sigmas']),
         ({'board': 'board', 'pixels': 1, 'sigmas': 's'}, True, ['s', 'board'], []),
+        ({'board': 'board', 'pixels': 1, 'scale': 'size'}, True, ['board', 'size'], []),
         ({'board': 'board', 'lens': 'lens', 'pixels': 1}, True, [], ['lens']),
         ({'scale': 'scale', 'sigmas': 'sigmas'}, True, ['sigmas', 'scale'], []),
         ({'sessions': 'two', 'given': 'gain'}, True, ['two', 'gain'], []),

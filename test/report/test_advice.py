@@ -61,6 +61,14 @@ def test_outliers_are_to_be_looked_at_if_much_is_left():
     assert told.steps[1:] == advice.rules()[Rule.LARGEST_ERROR].steps
 
 
+def test_no_rule_is_told_before_its_cause():
+    """A stretched board was told first, but on the page as a consequence of a wrong arm."""
+    brings = advice.BRINGS
+    pairs = [(rule, cause) for cause in brings for rule in brings[cause] if rule is not cause]
+    early = [pair for pair in pairs if pair[0].value < pair[1].value]
+    assert all(cause in brings.get(rule, ()) for rule, cause in early)
+
+
 @pytest.mark.parametrize('shift', [0.003, 0.02])
 def test_held_out_poses_further_off_ask_first_what_was_moved(shift):
     """The chain was to be checked, or more poses to be measured."""
