@@ -152,8 +152,11 @@ def hints(found: Verification) -> list[str]:
     if found.fitted:
         lines.append(f'{" and ".join(found.fitted)} refitted, before and after alike')
     if found.verdict == 'UNDECIDED' and not found.outside:
-        enough = f'about {found.needed:,}' if found.needed else f'not even {DECIDING:,}'
-        lines.append(f'{enough} poses with the same RMS error would decide, these included')
+        enough, side = f'not even {DECIDING:,}', 'decide'
+        if found.needed and found.limit:
+            side = f'be {"within" if found.rms <= found.limit else "beyond"} the limit'
+            enough = f'about {found.needed:,}'
+        lines.append(f'{enough} poses with the same RMS error would {side}, these included')
     before, rms = (each.rms_mm for each in found.comparison.figures)
     if found.outside and not found.mistake:
         share = round(100.0 * found.outside) or 'less than 1'
