@@ -323,8 +323,8 @@ class CalibrationSession:
     def problem_of(self, samples: Sequence[Sample], posed: bool = False) -> Problem:
         """Return samples as a problem; with `posed` boards as poses, not corners."""
         if all(sample.validation for sample in samples):
-            told = f'all {len(samples)} came on topics for validation: measure on others too'
-            raise InputError(f'no poses to fit: {told if samples else self.summary}')
+            told = f'all {len(samples)} came on topics for validation, measure on others too; '
+            raise InputError(f'no poses to fit: {told * bool(samples)}{self.summary}')
         found = dataset_of(samples, self.settings.sigmas, posed)
         return found.problem(self.chain, self.settings, of_messages=True)
 
