@@ -19,7 +19,7 @@ from calib_ros.decision.suspects import reordered, rows_away
 from calib_ros.decision.trials import in_frames, largest_of, sample_errors
 from calib_ros.decision.undoing import Sets, Suspect
 from calib_ros.estimation.configurations import count_distinct
-from calib_ros.estimation.levels import ALIKE, LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
+from calib_ros.estimation.levels import CLEARLY, LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import flange
@@ -81,8 +81,8 @@ def other_order(
 ) -> tuple[Suspect, float] | None:
     """Return in which order the rows of joint values stand, as `row_loss`.
 
-    That is the reverse one, or that of numbers as text. If no such order is worse than theirs, a
-    column that goes one way was perhaps sorted alone.
+    That is the reverse one, or that of numbers as text. If some such order is not clearly worse
+    than theirs, a column that goes one way was perhaps sorted alone.
     """
     rows = np.arange(len(seen))
     if not FEWEST_ROWS <= len(rows) <= MOST_SEARCHED:
@@ -101,10 +101,10 @@ def other_order(
         return (Suspect(orders[best][0], remedy), errors[best]) if best else None
     steps = np.diff(np.column_stack([seen.joints, seen.given]), axis=0)
     one_way = steps.any(axis=0) & ((steps >= 0).all(axis=0) | (steps <= 0).all(axis=0))
-    if ALIKE * errors[0] < min(errors[1:]) or not one_way.any():
+    if CLEARLY * errors[0] < min(errors[1:]) or not one_way.any():
         return None
     names = ', '.join(np.array([*nominal.joint_names, *'xyz'])[one_way])
-    what = 'the joint values fit the measurements no better than in any other order of the rows'
+    what = 'the joint values fit the measurements hardly better than in other orders of the rows'
     remedy = 'was one sorted without the others? If so, export them again, and sort whole rows'
     return Suspect(f'{what}, and one way from row to row goes {names}', remedy), np.nan
 

@@ -78,10 +78,10 @@ def test_rows_lost_before_the_first_and_again_later_are_not_told_as_one():
         (np.argsort(sorted(range(40), key=str)), 'measurements are sorted as text (0, 1, ', True),
         (
             'elbow_joint',
-            'any other order of the rows, and one way from row to row goes elbow_joint',
+            'other orders of the rows, and one way from row to row goes elbow_joint',
             False,
         ),
-        ('x', 'any other order of the rows, and one way from row to row goes x', False),
+        ('x', 'other orders of the rows, and one way from row to row goes x', False),
     ],
 )
 @pytest.mark.parametrize('oriented', [True, False])
@@ -96,6 +96,17 @@ def test_rows_of_joint_values_in_another_order_are_named(order, said, known, ori
     found = diagnose(Problem(UR10E, mixed))
     assert said in str(found)
     assert (found.corrected < 5e-3) == known
+
+
+@pytest.mark.parametrize('k', range(6))
+def test_the_values_of_one_joint_sorted_alone_are_named(k):
+    """Of a wrist they still fit three times better than in other orders of all rows."""
+    *_, seen = measured_arm(1, 40)
+    joints = seen.joints.copy()
+    joints[:, k] = np.sort(joints[:, k])
+    mixed = replace(seen, joints=joints)
+    found, _ = lost_rows.other_order(Problem(UR10E, mixed), UR10E, mixed, 0.01)
+    assert f'goes {UR10E.joint_names[k]}' in found.what
 
 
 def test_rows_that_fit_are_in_no_other_order_nor_are_those_of_messages():
