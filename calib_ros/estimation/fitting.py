@@ -77,9 +77,9 @@ def _excited_names(
 
 def _in_view(start: Chain, system: System) -> System:
     """Return a system without the few board points that a start sees far from where they are."""
-    kept = [in_view(start, each.observations) for each in system.sets]
-    most = 1.0 - np.concatenate(kept).mean() > MOST_OUTLIERS  # the start is wrong
-    return system if most else system.weighted([each.astype(float) for each in kept])
+    seen = (in_view(start, each.observations) for each in system.sets)
+    # if many of a set are, the start is wrong
+    return system.weighted([np.where(1.0 - e.mean() > MOST_OUTLIERS, 1.0, e) for e in seen])
 
 
 def _fit_all(
