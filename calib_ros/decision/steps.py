@@ -52,9 +52,9 @@ def find_step(fitted: Fitted, held: bool = False) -> Step | None:
     """
     if held and _Scan(fitted, loaded=True, gross=True).explained:
         return None
-    plain, found = _searched(fitted, loaded=False)
-    scan = plain
-    if found is None and fitted.noise.position >= SUSPICIOUS:
+    scan, found = _searched(fitted, loaded=False)
+    bends = found is None and fitted.noise.position >= SUSPICIOUS
+    if bends:
         scan, found = _searched(fitted, loaded=True)
     if found is not None:
         if scan.drifts(found):
@@ -63,12 +63,12 @@ def find_step(fitted: Fitted, held: bool = False) -> Step | None:
                 return None
             found = replace(found, size=2.0 * found.size, slow=True)  # the halves' means differ
         return scan.described(found)
-    found = plain.imitated(fitted)
-    torn = found is not None and found.group.kind in FRAMES and plain.torn
+    found = scan.imitated(fitted)
+    torn = found is not None and found.group.kind in FRAMES and scan.torn
     if found is not None and not torn and fitted.robust.outliers.any():
-        plain = _Scan(fitted, loaded=False, gross=False)  # these gross errors are no move
-        found = plain.imitated(fitted)
-    step = None if found is None else plain.described(found)
+        scan = _Scan(fitted, loaded=bends, gross=False)  # these gross errors are no move
+        found = scan.imitated(fitted)
+    step = None if found is None else scan.described(found)
     return step if step is not None and step.harmful else None  # else nothing was imitated
 
 
@@ -245,8 +245,8 @@ class _Scan:
         arm = Imitation(fitted, self._names[: self._fitted], self._products)
         highest, found = LEAST, None
         known = {*fitted.problem.given} | {*self._added} - {*fitted.problem.free}
-        groups = [g for g in self._groups if g.kind in FRAMES or known.isdisjoint(g.names)]
-        groups = [each for each in groups if not each.held]
+        groups = [g for g in self._groups if g.kind in FRAMES and not g.held]
+        groups += [g for g in self._groups if g.kind == 'joint' and known.isdisjoint(g.names)]
         trials = np.log(self._stops * len(self._groups))
         for group in groups:
             gains = arm.gains(*self._moving(group, every))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, arm, measured_arm
+from fits import NOISE, SIGMAS, UR10E, arm, at_stations, measured_arm
 
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
@@ -192,6 +192,18 @@ def test_another_load_from_the_first_pose_on_is_no_step_of_an_arm_that_is_held(h
     seen = measure(true, q, rng, *NOISE)
     fitted = fitting.fit(Problem(UR10E, seen, fixed=('*_joint.*',), **SIGMAS))
     assert (find_step(fitted, held) is None) == held
+
+
+@pytest.mark.parametrize(('seed', 'size', 'found'), [(10, 1e-3, ('base', 25)), (11, 0.0, None)])
+def test_a_load_hides_no_move_that_the_arm_imitates_nor_looks_like_one(seed, size, found):
+    load = {f'{joint}.gravity_wrist_3_joint': 5e-3 for joint in UR10E.joint_names[1:4]}
+    rng = np.random.default_rng(seed)
+    true = arm(rng).with_effects(list(load)).with_offsets(load)
+    seen = measure(true, at_stations(rng, 3), rng, *NOISE, oriented=bool(seed % 2))
+    positions = seen.positions + np.outer(np.arange(len(seen)) >= 25, size * np.array([1, 0, 0]))
+    moved = replace(seen, positions=positions)
+    step = find_step(fitting.fit(Problem(UR10E, moved, **SIGMAS)))
+    assert (step and (step.what, step.sample)) == found
 
 
 @pytest.mark.parametrize(('share', 'apart'), [(0.98, True), (1.02, False)])
