@@ -48,6 +48,7 @@ from calib_ros.estimation.samples import gram
 from calib_ros.estimation.shared_errors import gathered, nonnegative
 from calib_ros.estimation.sizes import LEAST_SIZE, REFUTED, SHOWN, SPREAD, TYPICAL, solved
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index
+from calib_ros.settings import EXCEPTION
 
 
 def unmodelled_errors(
@@ -120,7 +121,7 @@ def _sizes(
     whites = rows.any(axis=0).T & (part_of == np.arange(len(variances))[:, np.newaxis, np.newaxis])
     kernels = [*whites[..., np.newaxis] * np.eye(len(part_of))]
     kernels += [each @ np.swapaxes(each, 1, 2) for each in (turned, tilted)]
-    turn, tilt = _random(np.array(kernels), basis, residual[..., 0]).tolist()
+    turn, tilt = _random(np.array(kernels), basis, residual[..., 0], variances).tolist()
     return turn, tilt, waves, found is not None
 
 
@@ -183,10 +184,13 @@ def _shared(left: FloatArray, part_of: Index, groups: Index) -> FloatArray:
     return np.where(ratio > SUSPICIOUS, ratio, 1.0)
 
 
-def _random(kernels: FloatArray, basis: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return the standard deviations (2,) of the last two kernels (K, n, c, c).
+def _random(
+    kernels: FloatArray, basis: FloatArray, residual: FloatArray, variances: FloatArray
+) -> FloatArray:
+    """Return the standard deviations (2,) of the last two kernels (K + 2, n, c, c).
 
-    For the posterior's columns (n, c, P), scaled, and its residuals (n, c).
+    For the posterior's columns (n, c, P), scaled, and its residuals (n, c), and the noise (K,).
+    What looks like noise, as slides of three linear axes do, is as large as that beyond its sigma.
     """
     listed = kernels.reshape(len(kernels), -1)
     taken = listed @ (basis @ np.swapaxes(basis, 1, 2)).ravel()
@@ -196,7 +200,10 @@ def _random(kernels: FloatArray, basis: FloatArray, residual: FloatArray) -> Flo
     sizes = np.diag(pairs)  # white kernels have nothing in common
     own = sizes[arm] - (pairs[arm, white] ** 2 / sizes[white]).sum(axis=1)
     if not (excess > special.ndtri(0.5 + 0.5 * CERTAIN) * np.sqrt(2.0 * own)).any():
-        return np.zeros(2)
+        beyond = np.where(variances > SUSPICIOUS**2, 1.0 - 1.0 / variances, 0.0)
+        alike = own <= EXCEPTION * sizes[arm]
+        squares = alike * (pairs[arm, white] @ beyond) / np.maximum(sizes[arm], 1e-300)
+        return np.asarray(np.sqrt(squares))
     flat, spread = (x.reshape(*x.shape[:-3], -1, x.shape[-1]) for x in (basis, kernels @ basis))
     inner = flat.T @ spread
     cross, both = (x @ x.T for x in (x.reshape(len(kernels), -1) for x in (spread, inner)))

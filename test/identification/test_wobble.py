@@ -22,7 +22,9 @@ from calib_ros.estimation.joint_errors import (
 )
 from calib_ros.identification.calibration import parse_calibration
 from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.joint import Joint
 
 WIDTH = 0.6  # rad, either way
 
@@ -175,6 +177,19 @@ def test_what_waves_explain_is_not_random_too(seed):
     arm.sizes *= 0.0
     still = identify(arm.measured(np.zeros(6), 150, 3.1)).posterior.unmodelled
     assert not any(still.sizes.values())
+
+
+@pytest.mark.parametrize('slides', [8e-5, 1e-12])
+def test_beyond_the_sigma_what_looks_like_noise_is_slides_of_three_linear_axes(slides):
+    """A ball screw's waves are no noise of a device with a stated sigma."""
+    turned = {'alpha': -np.pi / 2, 'theta': -np.pi / 2}
+    axes = [Joint(name, 'prismatic', lower=0.0, upper=1.0, **turned) for name in 'xy']
+    chain = Chain('gantry', 'standard', (*axes, Joint('z', 'prismatic', lower=0.0, upper=0.5)))
+    rng = np.random.default_rng(0)
+    true, q = faulty(chain, Cell(), rng), chain.random_joints(60, rng)
+    seen = measure(true, q + rng.normal(scale=slides, size=q.shape), rng, *NOISE)
+    result = identify(Problem(chain, replace(seen, joints=q), **SIGMAS))
+    assert result.posterior.unmodelled.turns == pytest.approx(slides, rel=0.2, abs=1e-9)
 
 
 def test_few_poses_of_a_sound_arm_are_not_expected_to_be_twice_as_bad():
