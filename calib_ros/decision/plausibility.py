@@ -67,7 +67,9 @@ def add_remarks(problem: Problem, result: Identification, another: bool = True) 
     if all(each.socket or each.plane for each in problem.sets):  # shows only the scale of a bar
         refused = _scale(problem, result) if problem.separations else []
         return replace(result, refusals=(*result.refusals, *refused))
-    lens, imitated = _lens(problem, result) if another else ('', False)
+    result = _lag(problem, result)
+    late = any(each.rule is Rule.LAG for each in result.refusals)
+    lens, imitated = _lens(problem, result) if another and not late else ('', False)
     board = '' if lens else stretched(problem, result)
     sigmas, refusals = _sigmas(problem, result), [*result.refusals, *_scale(problem, result)]
     if board and all(each.pixels is not None for each in problem.sets):
@@ -87,7 +89,7 @@ def add_remarks(problem: Problem, result: Identification, another: bool = True) 
     loose, order = loose_target(problem.sets), _order(problem)
     found = (other, lens, board, judged, coupled, level, loose, motion, order, sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
-    return _lag(problem, replace(result, remarks=remarks, refusals=tuple(refusals)))
+    return replace(result, remarks=remarks, refusals=tuple(refusals))
 
 
 def _scale(problem: Problem, result: Identification) -> Iterator[Reason]:
@@ -228,10 +230,8 @@ def _lag(problem: Problem, result: Identification) -> Identification:
 def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | None] | None:
     """Return that poses lie towards the previous stop, and the problem with that delay.
 
-    Or that the joints have play, without a problem; None for images, or if neither explains most.
+    Or that the joints have play, without a problem; None if neither explains most.
     """
-    if any(each.pixels is not None for each in problem.sets):
-        return None
     bases = sorted({each.base for each in problem.sets})
     chain, delays = result.chain, [Parameter(name, DELAY) for name in bases]
     for name in bases:
@@ -264,9 +264,11 @@ def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | 
 
 def _with_moves(each: Observations) -> Observations:
     """Return poses with the last move (N, n) as velocity, and its sign where unknown."""
-    order = np.argsort(each.stamps_ns, kind='stable')
-    moves = np.zeros_like(each.joints)
-    moves[order[1:]] = np.diff(each.joints[order], axis=0)
+    begins = np.flatnonzero(np.diff(each.images, prepend=-1))
+    order, joints = np.argsort(each.stamps_ns[begins], kind='stable'), each.joints[begins]
+    moves = np.zeros_like(joints)
+    moves[order[1:]] = np.diff(joints[order], axis=0)
+    moves = moves[each.images]
     signs = np.sign(moves) if each.approach is None else each.approach
     return replace(each, velocity=moves, approach=signs, delay=np.zeros(len(each)))
 
