@@ -354,12 +354,10 @@ def test_a_session_is_judged_without_a_tolerance(arm, cell):
             assert found.needed > 10
             same = verify(arm, seen, 1.5 * residual)
             assert (same.verdict, same.needed) == (verdict, found.needed)
-            fate = 'within' if rms < found.limit else 'beyond'
-            told = f'about {found.needed} poses with the same RMS error would be {fate} the limit'
-            assert told in in_words(found)
-            page = verification_page(UR, seen, found)
+            told = f'would be {"within" if rms < found.limit else "beyond"} the limit'
+            assert f'about {found.needed} poses with the same RMS error {told}' in in_words(found)
             said = f'1.5 times the expected error: {rounded(1.5e3 * residual)} mm. If the whole'
-            assert any(said in text for text in page.verdict.text)
+            assert any(said in text for text in verification_page(UR, seen, found).verdict.text)
         else:
             assert found.needed == needed
         assert f'poses like these is {rounded(1e3 * found.rms)} mm (' in in_words(found)
