@@ -199,7 +199,8 @@ def _random(
     excess = (values + taken - np.einsum('knii->k', kernels))[arm]
     sizes = np.diag(pairs)  # white kernels have nothing in common
     own = sizes[arm] - (pairs[arm, white] ** 2 / sizes[white]).sum(axis=1)
-    if not (excess > special.ndtri(0.5 + 0.5 * CERTAIN) * np.sqrt(2.0 * own)).any():
+    clear = np.where(own > HALF_THE_DIGITS * sizes[arm], own, np.inf)  # not white but for rounding
+    if not (excess > special.ndtri(0.5 + 0.5 * CERTAIN) * np.sqrt(2.0 * clear)).any():
         beyond = np.where(variances > SUSPICIOUS**2, 1.0 - 1.0 / variances, 0.0)
         alike = own <= EXCEPTION * sizes[arm]
         squares = alike * (pairs[arm, white] @ beyond) / np.maximum(sizes[arm], 1e-300)
