@@ -70,6 +70,6 @@ def test_a_command_that_is_terminated_tidies_up(tmp_path, monkeypatch):
     """As by timeout, systemd or docker stop: it ends like one that is interrupted."""
     arguments = ['identify', '--csv', 'unread', '--chain', 'ur5e', '--out', str(tmp_path / 'out')]
     monkeypatch.setattr(sys, 'argv', ['calib_ros', *arguments])
-    monkeypatch.setattr(identify, 'identified', lambda *_: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr(identify, '_loaded', lambda *_: signal.raise_signal(signal.SIGTERM))
     assert status_of(forked(lambda: os._exit(main.main()))) == 130
     assert list(tmp_path.iterdir()) == []
