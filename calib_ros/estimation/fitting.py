@@ -20,7 +20,7 @@ from calib_ros.estimation import identifiability
 from calib_ros.estimation.evidence import Inference
 from calib_ros.estimation.fitted import Fitted, SimplerFit
 from calib_ros.estimation.leastsquares import System, factor_of, minimise, triangular_factor
-from calib_ros.estimation.levels import CONFIDENT, MOST_OUTLIERS
+from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.noise import Noise, noise_of, squares_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.pixels import in_view
@@ -67,19 +67,17 @@ def _excited_names(
     priors = problem.prior_sigmas
     wanted = [n for n in problem.free if n in structural or n in priors]
     few, every = problem.system([each.spread(SOME) for each in problem.sets]), problem.sets
-    factor = factor_of(start, wanted, _in_view(start, few))
+    factor = factor_of(start, wanted, _seen(start, few))
     names = identifiability.excited(factor, wanted)
     if len(names) < len(wanted) and few.count < sum(map(len, every)):  # more may determine more
-        system = _in_view(start, problem.system(every))
+        system = _seen(start, problem.system(every))
         names = identifiability.excited(triangular_factor(start, wanted, system), wanted)
     return names, np.asarray(np.linalg.qr(factor[:, np.isin(wanted, names)], mode='r'))
 
 
-def _in_view(start: Chain, system: System) -> System:
+def _seen(start: Chain, system: System) -> System:
     """Return a system without the few board points that a start sees far from where they are."""
-    seen = (in_view(start, each.observations) for each in system.sets)
-    # if many of a set are, the start is wrong
-    return system.weighted([np.where(1.0 - e.mean() > MOST_OUTLIERS, 1.0, e) for e in seen])
+    return system.weighted([in_view(start, e.observations).astype(float) for e in system.sets])
 
 
 def _fit_all(

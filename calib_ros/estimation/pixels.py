@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib_ros.estimation.levels import MOST_OUTLIERS
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.resection import image_products
 from calib_ros.estimation.robust import INNER
@@ -185,13 +186,14 @@ def seen_residuals(chain: Chain, observations: Observations) -> Both:
 def in_view(chain: Chain, observations: Observations) -> Flags:
     """Tell (N,) which points a chain sees within a focal length [px] of where they are.
 
-    Columns of others grow without bound towards the plane of the camera and behind it. All are
-    if nothing was measured in pixels.
+    Columns of others grow without bound towards the plane of the camera and behind it. All are if
+    nothing was measured in pixels, or if many are not: then the chain is wrong.
     """
     if observations.pixels is None:
         return np.ones(len(observations), dtype=bool)
     lens = require_lens(chain.frame(observations.camera).lens, observations.camera)
-    return np.asarray(norms(seen_residuals(chain, observations)[0]) < lens.fx)
+    seen = norms(seen_residuals(chain, observations)[0]) < lens.fx
+    return np.asarray(seen | (1.0 - seen.mean() > MOST_OUTLIERS))
 
 
 def samples_of(
