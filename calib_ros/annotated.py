@@ -76,6 +76,8 @@ def check_fields(made: Any) -> None:
 def _fitting(value: Any, hint: Any, name: str, finite: bool) -> Any:
     """Return a value as annotated; the ConfigError or InputError for another one has its name."""
     kind, parts = get_origin(hint) or hint, get_args(hint)
+    if hasattr(kind, '__value__'):  # a generic alias, as NDArray is from numpy 2.5 on
+        return _fitting(value, kind.__value__[parts], name, finite)
     if kind is Annotated:
         return _passing(_fitting(value, parts[0], name, finite), name, *parts[1:])
     if kind in (typing.Union, UnionType):
