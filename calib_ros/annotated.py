@@ -32,6 +32,7 @@ Count: TypeAlias = Annotated[int, lambda x: x >= 1, 'at least 1']
 Several: TypeAlias = Annotated[int, lambda x: x >= 2, 'at least 2']
 _F = TypeVar('_F', bound=Callable[..., Any])
 _FLAGS = ('bool', 'bool_')  # of Python, and of both generations of numpy
+_ARRAYS = ('ndarray', 'NDArray')  # before numpy 2.5, and since, of another form
 _QUOTED = (str, Real, NoneType, tuple, list)
 _TESTS: dict[Any, Callable[[Any], bool]] = {
     bool: lambda x: type(x).__name__ in _FLAGS,
@@ -76,8 +77,6 @@ def check_fields(made: Any) -> None:
 def _fitting(value: Any, hint: Any, name: str, finite: bool) -> Any:
     """Return a value as annotated; the ConfigError or InputError for another one has its name."""
     kind, parts = get_origin(hint) or hint, get_args(hint)
-    if hasattr(kind, '__value__'):  # a generic alias, as NDArray is from numpy 2.5 on
-        return _fitting(value, kind.__value__[parts], name, finite)
     if kind is Annotated:
         return _passing(_fitting(value, parts[0], name, finite), name, *parts[1:])
     if kind in (typing.Union, UnionType):
@@ -90,10 +89,10 @@ def _fitting(value: Any, hint: Any, name: str, finite: bool) -> Any:
         if value in parts:
             return value
         raise UnknownNameError(name, value, parts)
-    elif getattr(kind, '__name__', '') == 'ndarray':
+    elif getattr(kind, '__name__', '') in _ARRAYS:
         from calib_ros.values import array_of  # loads numpy, not needed by --help
 
-        return array_of(value, get_args(parts[1])[0], name, finite)
+        return array_of(value, (get_args(parts[-1]) or parts)[0], name, finite)
     elif kind is Mapping and isinstance(value, Mapping):
         return {
             _fitting(key, parts[0], f'a key of {name}', finite): _fitting(

@@ -10,11 +10,14 @@ import sys
 from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import new_class
+from typing import Generic, TypeVar
 
 import numpy as np
 import pytest
 
 import calib_ros
+from calib_ros.annotated import as_annotated
 from calib_ros.apply.design import Design
 from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import measure
@@ -86,6 +89,19 @@ def test_limits_of_what_is_accepted_may_be_infinite(name):
 def test_arguments_of_another_type_are_named(call, said):
     with pytest.raises(calib_ros.CalibrationError, match=said):
         call()
+
+
+def test_arrays_are_taken_where_their_type_is_a_generic_alias():
+    """As `NDArray` is from numpy 2.5 on: no command ran there."""
+    array = new_class('NDArray', (Generic[TypeVar('Scalar', bound=np.generic)],))
+
+    @as_annotated
+    def taken(values: array[np.float64]):
+        return values
+
+    np.testing.assert_equal(taken([1, 2]), [1.0, 2.0])
+    with pytest.raises(calib_ros.CalibrationError, match='values must be real numbers'):
+        taken('a')
 
 
 def test_results_are_read_only():
