@@ -16,13 +16,12 @@ import io
 import json
 import os
 import tempfile
-import time
 from pathlib import Path
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
-from peers import machine
+from peers import cpu, machine
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
@@ -66,16 +65,6 @@ def command(*arguments):
     """Run the command line without its words."""
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         calib_ros([str(each) for each in arguments])
-
-
-def cpu(run, times=1):
-    """Return the least CPU time [s]."""
-    best = np.inf
-    for _ in range(times):
-        begin = time.process_time()
-        run()
-        best = min(best, time.process_time() - begin)
-    return best
 
 
 def cases(folder, quick):

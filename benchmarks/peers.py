@@ -30,6 +30,7 @@ import platform
 import subprocess
 import sys
 import tempfile
+import time
 import venv
 from dataclasses import replace
 from datetime import date
@@ -254,6 +255,16 @@ def draw(found, path):
     axes[0, -1].legend(fontsize=8, loc='center left', bbox_to_anchor=(1.0, 0.5))
     figure.tight_layout()
     figure.savefig(path, dpi=110)
+
+
+def cpu(run, times=1):
+    """Return the least CPU time [s] of some runs."""
+    best = np.inf
+    for _ in range(times):
+        begin = time.process_time()
+        run()
+        best = min(best, time.process_time() - begin)
+    return best
 
 
 def machine():

@@ -14,12 +14,12 @@ import argparse
 import json
 import os
 import tempfile
-import time
 from pathlib import Path
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
+from peers import cpu
 
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout
@@ -64,16 +64,6 @@ def tables_of(folder, rows):
         yield kind, path, range(2, 2 + len(header))
 
 
-def cpu(run):
-    """Return the least CPU time [s] of some runs."""
-    best = np.inf
-    for _ in range(RUNS):
-        begin = time.process_time()
-        run()
-        best = min(best, time.process_time() - begin)
-    return best
-
-
 def main():
     """Print a line for each kind of table."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
@@ -85,7 +75,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         for kind, path, use in tables_of(Path(folder), options.rows):
             how = foreign if kind == 'foreign' else None
-            ours = cpu(lambda path=path, how=how: read_table(path, JOINTS, foreign=how))
+            ours = cpu(lambda path=path, how=how: read_table(path, JOINTS, foreign=how), RUNS)
             plain = path
             if kind == 'foreign':
                 plain = path.with_name('plain.csv')
@@ -93,7 +83,8 @@ def main():
             theirs = cpu(
                 lambda plain=plain, use=use: np.loadtxt(
                     plain, delimiter=',', skiprows=1, usecols=use
-                )
+                ),
+                RUNS,
             )
             row = {'table': kind, 'rows': options.rows, 'read_table_s': ours, 'loadtxt_s': theirs}
             found.append(row | {'ratio': ours / theirs})
