@@ -16,6 +16,14 @@ from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 
 
+def refuse_empty(what: str, corners: FloatArray) -> None:
+    """Refuse corners (2, 3) whose lower one does not come first."""
+    if not (corners[0] <= corners[1]).all():
+        lower, upper = corners.tolist()
+        empty = f'the {what} from {lower} to {upper} is empty'
+        raise ConfigError(f'{empty}: give the lower corner first')
+
+
 @dataclass(frozen=True, eq=False)
 class Visibility:
     """Where the measuring device sees the target.
@@ -32,11 +40,8 @@ class Visibility:
     world: bool = False
 
     def __post_init__(self) -> None:
-        if self.box is not None and not (self.box[0] < self.box[1]).all():
-            raise ConfigError(
-                f'the box from {self.box[0].tolist()} to {self.box[1].tolist()} is empty: give '
-                'the lower corner first'
-            )
+        if self.box is not None:
+            refuse_empty('box', self.box)
         for name, given in (('box', self.box), ('tracker', self.tracker)):
             far = () if given is None or self.world else np.abs(given).ravel()
             if any(100.0 < each < np.inf for each in far):

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from calib_ros.annotated import Count, as_annotated
+from calib_ros.apply.candidates import refuse_empty
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import STILL
 from calib_ros.identification.calibration import Calibration
@@ -188,11 +189,7 @@ def place(
     """
     search = _Search(arm, task, aim, model, progress)
     corners = search.reach if region is None else region
-    if not (corners[0] <= corners[1]).all():
-        raise InputError(
-            f'the region from {corners[0].tolist()} to {corners[1].tolist()} is empty: give the '
-            'lower corner first'
-        )
+    refuse_empty('region', corners)
     axes = [np.linspace(low, high, cells) for low, high in corners.T]
     angles = 2.0 * np.pi * np.arange(turns) / turns
     grid = np.stack(np.meshgrid(*axes, angles, indexing='ij'), axis=-1).reshape(-1, 4)

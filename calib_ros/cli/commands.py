@@ -315,6 +315,7 @@ what to convert
   --chain! ROBOT  {CHAIN}
   --session NAME  only rows with this name in the column session
   --storage {'|'.join(STORAGES)}=mcap  storage format of the bag
+{LAYOUT}
 """
 
 

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 
 import numpy as np
 
@@ -13,9 +12,8 @@ from calib_ros.atomic import write_file
 from calib_ros.cli import common, inputs
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
-from calib_ros.errors import CalibrationError, InputError
+from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files import loading
 from calib_ros.files.columns import as_csv
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.journal import table_text
@@ -46,12 +44,7 @@ def _convert(options: argparse.Namespace, screen: Screen) -> int:
 def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.csv, 'csv2bag', 'table')
     chain = load_chain(options.chain)
-    try:
-        table = loading.table(options.csv, chain, Settings(), common.sessions_of(options))
-    except CalibrationError as err:
-        if re.search('--(?!chain|session)[a-z]', told := str(err)):  # no cell of a table
-            told += '; these are options of calib_ros import: convert the table with it first'
-        raise InputError(told) from err
+    table = inputs.table_of(options, options.csv, chain, Settings(), screen)
     for warning in table.warnings:
         screen.warn(warning)
     every = [*table.fitted, *table.held_out]

@@ -56,7 +56,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     with common.output_files(options, (*RESULT_FILES, 'report.pdf')) as contents:
         loaded = _loaded(options, screen)
         read = (options.csv, options.detections, options.measured)
-        found = identified(options, screen, loaded, *read)
+        found = replace(identified(options, screen, loaded, *read), tolerance=options.tolerance)
         if options.out is not None:
             contents |= result_files(found, screen, options.out, options.pdf)
     shown = () if found.result.accepted and not options.json else words.other_remarks(found.result)
@@ -88,8 +88,8 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         previous = inputs.calibration_of(
             options.previous, 'identify --previous', loaded.problem.chain
         )
-        options.serial = previous.serial_of(str(options.previous), options.serial)
-        known = {'robot_serial': options.serial} if options.serial else {}
+        serial = previous.serial_of(str(options.previous), options.serial)
+        known = {'robot_serial': serial} if serial else {}
         previous = replace(previous, record={**previous.record, **known})
         for warning in loaded.warnings:
             screen.warn(warning)
@@ -126,7 +126,8 @@ def _update_files(
     read = (options.csv, options.detections, options.measured, calibration_file(options.previous))
     sets, arm = loaded.problem.all_sets, found.calibration.chain
     poses = poses_to_verify(arm, sets, found.comparison, loaded.by_line)
-    origin = inputs.origin_of(options, read)
+    serial = found.calibration.serial_of(str(options.previous))
+    origin = inputs.origin_of(options, read, serial=serial)
     report = applied.update_report(found, poses, origin, loaded.warnings)
     contents |= {'residuals.csv': poses.table(), 'report.md': markdown(report, {})}
     return contents | inputs.page_of(report, screen, pdf=options.pdf)
@@ -162,10 +163,10 @@ def identified(
     """Identify what was loaded from the files that were read."""
     settings = common.settings_of(options)
     configuration = documents.configuration_yaml(options.chain, settings)
-    origin = inputs.origin_of(options, read, configuration)
+    origin = inputs.origin_of(options, read, settings=configuration)
     with screen.work('identifying') as work:
         result = loaded.identified(settings.model, work)
-    return Identified(loaded, result, origin, vars(options).get('tolerance'))
+    return Identified(loaded, result, origin)
 
 
 def _loaded(options: argparse.Namespace, screen: Screen) -> Loaded:

@@ -100,14 +100,14 @@ def filing_of(
 
 
 def origin_of(
-    options: argparse.Namespace, inputs: Sequence[Path | None], settings: str = ''
+    options: argparse.Namespace, inputs: Sequence[Path | None], **more: str
 ) -> page.Origin:
-    """Return the origin of a result: the options, and the files read."""
+    """Return the origin of a result: the options, what `more` is known, and the files read."""
     chain = Path(options.chain)
     beside = (vars(options).get(name) for name in ('joints', 'places', 'board', 'intrinsics'))
-    known = (*inputs, *beside, chain if chain.is_file() else None)
+    read = rows.inputs_of(*inputs, *beside, chain if chain.is_file() else None)
     people = {name: getattr(options, name, '') for name in OF_REPORTS}
-    return page.Origin(rows.inputs_of(*known), settings=settings, command=options.typed, **people)
+    return page.Origin(read, command=options.typed, **people | more)
 
 
 def page_of(

@@ -24,10 +24,9 @@ from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify
 from calib_ros.report.advice import ENOUGH
-from calib_ros.report.applied import plan_report
+from calib_ros.report.applied import VISIT, plan_report
 
 TESTS = 'P1 to P5 of ISO 9283 in a cube of {:.3f} m, in {}; collisions are not checked'
-VISIT = 'visit P1 to P5 in turn, 30 times, and measure each time'
 NOISE = 'device noise: {:g} mm in each direction (--sigma-position)'
 WITH_TURNS = 'orientations count as measured, too (for a reflector alone: --measured position)'
 NOT_OF_TESTS = ('poses', 'accuracy', 'candidates', 'task', 'taken', 'draw', 'criterion', 'apart')

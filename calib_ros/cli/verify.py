@@ -53,7 +53,7 @@ def _verified(
     filed = inputs.history_of(options)
     nominal = load_chain(options.chain)
     arm = inputs.calibration_of(options.calibration, 'verify --calibration', nominal)
-    options.serial = arm.serial_of(str(options.calibration), options.serial)
+    serial = arm.serial_of(str(options.calibration), options.serial)
     sets, warnings, by_line = _sets(options, nominal, arm, screen)
     commanded = read_joints(options.commanded, nominal) if options.commanded else None
     tolerance = None if options.tolerance is None else 1e-3 * options.tolerance
@@ -82,7 +82,7 @@ def _verified(
     read = (options.measured, options.commanded, calibration_file(options.calibration))
     with screen.work('writing the report') as work:
         poses = poses_to_verify(found.chain, sets, found.comparison, by_line)
-        origin = inputs.origin_of(options, read)
+        origin = inputs.origin_of(options, read, serial=serial)
         report = verdicts.verification_report(arm.chain, found, poses, origin, warnings)
         contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
         contents['report.md'] = markdown(report, {})

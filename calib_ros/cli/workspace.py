@@ -64,8 +64,8 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)
         contents['placed_task.csv'] = joints_csv(found.joints[found.best])
-    options.serial = arm.serial_of(str(options.result), options.serial)
-    origin = inputs.origin_of(options, (calibration_file(options.result),))
+    serial = arm.serial_of(str(options.result), options.serial)
+    origin = inputs.origin_of(options, (calibration_file(options.result),), serial=serial)
     with screen.work('writing the report'):
         report = workspace_report(arm, survey, origin, found)
         contents['workspace.md'] = markdown(report, {})

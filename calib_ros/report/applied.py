@@ -27,6 +27,7 @@ from calib_ros.shown import rounded, sentence
 BEYOND = 'To use the calibration beyond the measured poses, measure there too.'
 STAYS = 'the arm is unchanged within the uncertainty: the correction that it has stays valid'
 PREDICTED = '"Before": by the earlier calibration; "after": predicted from the other new poses.'
+VISIT = 'visit P1 to P5 in turn, 30 times, and measure each time'
 PLACE = 'To find the best place for a task: calib_ros workspace with --task FILE.'
 
 
@@ -140,7 +141,7 @@ def plan_report(
     verdict = Headline('info', what, (f'{len(joints)} poses.',))
     steps: tuple[str, ...] = (
         'If you correct programs, not the controller, correct these poses: calib_ros compensate.',
-        'Visit P1 to P5 in turn, 30 times, and measure each time.',
+        sentence(VISIT),
         'Then judge: calib_ros verify with --commanded and these poses as they are here.',
     )
     if found is not None:

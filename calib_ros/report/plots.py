@@ -47,8 +47,8 @@ def before_after_png(result: Identification) -> bytes:
     right.set(xlabel='position error [mm]', ylabel=f'{thing}s with at most this error [%]')
     right.set(xlim=(0, None), ylim=(0, 100))
     right.grid(alpha=0.3)
-    title = f'{one_line(result.chain.name)}, judged by {result.validated_by.partition(";")[0]}'
-    figure.suptitle(title, parse_math=False)
+    judged = 'held-out' if result.validation else 'fitted'
+    figure.suptitle(f'{one_line(result.chain.name)}, {judged} {thing}s', parse_math=False)
     return _png(figure)
 
 
