@@ -266,7 +266,7 @@ def show(found: Identified, screen: Screen) -> None:
     result = found.result
     if found.loaded.read:
         screen.say(found.loaded.read)
-    reasons = reports.advice_of(result)
+    reasons = reports.advice_of(found.loaded.problem, result)
     verdict = reports.result_standing(result, reasons, found.wanted)
     screen.title(verdict.heading, GOOD_OR_BAD.get(verdict.state))
     screen.table(_rows(result))

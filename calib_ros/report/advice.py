@@ -35,10 +35,14 @@ class Advice:
     again: str = AGAIN  # what to identify next
     in_short: str = ''  # the heading, with the mistake if there is one
     sound: bool = False  # whether the arm shows no errors
+    unless: tuple[str, ...] = ()  # for each step, when it is needless
 
 
 ENOUGH = 25  # poses worth judging, and the default of `calib_ros plan`: a convention
 SPREAD_OUT = 'spread over the whole workspace, with every joint moved through most of its range'
+
+
+STEP = re.compile(r'^\d\. (?:<!-- unless (\w+) -->)?', re.MULTILINE)
 
 
 @cache
@@ -49,10 +53,10 @@ def rules() -> Mapping[Rule, Advice]:
     for section in file.read_text(encoding='utf-8').split('\n## ')[1:]:
         heading, about, listed, *again = section.split('\n\n')
         name, meaning = about.removeprefix('`Rule.').split('`. ', 1)
-        steps = tuple(map(_unwrapped, re.split(r'^\d\. ', listed, flags=re.MULTILINE)[1:]))
-        found[Rule[name]] = Advice(
-            heading, _unwrapped(meaning), steps, again=_unwrapped(' '.join(again)) or AGAIN
-        )
+        _, *parts = STEP.split(listed)
+        steps, last = tuple(map(_unwrapped, parts[1::2])), _unwrapped(' '.join(again)) or AGAIN
+        unless = tuple(parts[::2])
+        found[Rule[name]] = Advice(heading, _unwrapped(meaning), steps, again=last, unless=unless)
     return found
 
 
@@ -130,17 +134,17 @@ IN_BETWEEN = (
 class Situation:
     """Different poses, residual over stated noise, that noise [m], and what else is known.
 
-    Whether model is auto, poses share errors in succession only, how many are outliers, and
-    whether chosen held-out poses are further off than expected.
+    Whether poses share errors in succession only, how many are outliers, whether chosen held-out
+    poses are further off than expected, and which marks in `refusals.md` make a step needless.
     """
 
     poses: int = ENOUGH
     left: float = 1.0
     sigma: float | None = None
-    auto: bool = False
     drifts: bool = False
     outliers: int = 0
     contradicted: bool = False
+    needless: tuple[str, ...] = ()
 
     def first_of(self, rule: Rule) -> tuple[str, ...]:
         """Return what to do before the steps of a rule."""
@@ -157,8 +161,7 @@ class Situation:
     def said_of(self, one: Advice) -> Advice:
         """Return the advice on an unproven correction that suits the situation."""
         if self.left >= FAR:
-            steps = (each for each in one.steps if 'stood still' not in each)
-            return replace(one, steps=(COARSE.format(self.left), *steps))
+            return replace(one, steps=(COARSE.format(self.left), *one.steps))
         if self.poses < ENOUGH:
             more = rules()[Rule.CONFIGURATIONS].steps
             return replace(one, meaning=FEW_POSES.format(self.poses), steps=more)
@@ -180,14 +183,14 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
         if (cause := next(causes, rule)) is not rule:
             following.setdefault(cause, []).extend(texts)
             continue
-        short = heading = rules()[rule].heading
+        general = rules()[rule]
+        short = general.heading
         if rule is Rule.MISTAKE:
-            short = f'{heading}: {"; ".join(each.short for each in texts)}'
-        refusal = replace(rules()[rule], refusal='; '.join(texts), in_short=short)
-        needless = ['--model auto'] * situation.auto
-        needless += ['publisher'] * ('publisher' not in refusal.refusal)
-        steps = (each for each in refusal.steps if not any(word in each for word in needless))
-        refusal = replace(refusal, steps=tuple(steps))
+            short += f': {"; ".join(each.short for each in texts)}'
+        needless = (*situation.needless, *['coarse'] * (situation.left >= FAR))
+        marked = zip(general.steps, general.unless, strict=True)
+        steps = tuple(step for step, mark in marked if mark not in needless)
+        refusal = replace(general, steps=steps, refusal='; '.join(texts), in_short=short)
         if rule in UNSURE:
             refusal = situation.said_of(refusal)
         first = situation.first_of(rule)

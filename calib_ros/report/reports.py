@@ -58,7 +58,7 @@ def identification_report(
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     problem, judged = loaded.problem, result.validation or result.fitted
     poses = poses or poses_of(problem, result, loaded.by_line, loaded.images)
-    reasons = advice_of(result)
+    reasons = advice_of(problem, result)
     text = filter(None, _text(result, reasons, tolerance))
     shown = 2 if result.accepted else int(_sound(reasons))
     gain = sections.gain(judged, count=shown) if shown else ''
@@ -170,7 +170,7 @@ def _within(judged: Comparison, tolerance: float | None, when: int = 1) -> tuple
     return f', but {"" if verdict == "FAIL" else "perhaps "}not {wanted}', False
 
 
-def advice_of(result: Identification) -> tuple[Advice, ...]:
+def advice_of(problem: Problem, result: Identification) -> tuple[Advice, ...]:
     """Return why a result was refused, in plain words, and what to do.
 
     What the fit left, by its ratio to the stated noise, is that noise in the same figure. A fit of
@@ -189,10 +189,10 @@ def advice_of(result: Identification) -> tuple[Advice, ...]:
     numbers = (each.after.configurations for each in (result.fitted, *held_out))
     poses = sum(map(count_distinct, numbers))
     sigma = None if result.images else result.noise.given.get('sigma_position')
-    auto, drifts = bool(result.verdicts), words.drifts(result.noise)
     contradicted = bool(held_out) and bool(result.surprise)
-    situation = Situation(poses, noise, sigma, auto, drifts, len(result.outliers), contradicted)
-    return advice(result.refusals, situation)
+    needless = (*['auto'] * bool(result.verdicts), *['table'] * (not problem.of_messages))
+    about = words.drifts(result.noise), len(result.outliers), contradicted, needless
+    return advice(result.refusals, Situation(poses, noise, sigma, *about))
 
 
 def may_be_closer(result: Identification, beyond: bool = False) -> bool:

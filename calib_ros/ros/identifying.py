@@ -181,7 +181,7 @@ class Identifying:
 
     def _judged(self, given: Snapshot, result: Identification) -> Answer:
         loaded = given.loaded
-        steps = (step for reason in advice_of(result) for step in reason.steps)
+        steps = (step for reason in advice_of(loaded.problem, result) for step in reason.steps)
         telling = next((each.short for each in result.refusals if each.rule in TELLING_RULES), '')
         first = next(steps, '') if telling else given.cause or next(steps, '')
         numbers = {each: given.number_of(each) for each in result.outliers}
