@@ -29,6 +29,7 @@ from calib_ros.values import SAME
 WEAK = Settings.largest_error
 """Standard deviation [m or rad] beyond which a parameter is named as weakly determined: an arm
 with such an error is not accepted."""
+REFUSED = 'NOT accepted, nothing is published'
 
 
 def summary(
@@ -37,33 +38,42 @@ def summary(
     warnings: Sequence[str] = (),
     first: str = '',
 ) -> str:
-    """Return the one line for the operator.
+    """Return the one line for the operator, which begins with the `verdict`.
 
     `numbers` of outlier samples name these; `warnings` are of the measurements; `first` is what to
     do first about a refusal.
     """
-    figures = (result.validation or result.fitted).figures
-    text = f'{fitted_data(result)}, {rms_change(figures)} ('
-    if likely := rms_range_mm(result.validation, 1):
-        text += f'95 %: {likely} mm; '
-    text += f'by {result.validated_by})'
-    if pixels := rms_change(figures, 'px'):
-        text += f', {pixels}'
+    text = f'judged by {result.validated_by}'
     if count := len(result.outliers):
         where = ', see the report' if numbers is None else f': {_named(result.outliers, numbers)}'
         text += '; 1 outlier carries' if count == 1 else f'; {count} outliers carry'
         text += f' little or no weight{where}'
-    if result.accepted and result.region is not None:
-        text += f'; {result.region.in_words()}'
     if result.unidentifiable:
         text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'
     text = '; '.join((text, *notes(result)))
     if more := (*warnings, *other_remarks(result)):
         text += f'; note: {"; ".join(more)}'
     if result.accepted:
-        return f'accepted: {text}'
+        return f'{verdict(result)}; {text}'
     todo = f'To do first: {first} ' if first else ''
-    return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {todo}{text}'
+    return f'{verdict(result)}. {todo}{_figures(result)}; {text}'
+
+
+def verdict(result: Identification) -> str:
+    """Return why a result is refused, or its errors and where it is valid."""
+    if not result.accepted:
+        return f'{REFUSED}: {"; ".join(result.refusals)}'
+    valid = '' if result.region is None else f'; {result.region.in_words()}'
+    return f'accepted: {_figures(result)}{valid}'
+
+
+def _figures(result: Identification) -> str:
+    figures = (result.validation or result.fitted).figures
+    text = f'{fitted_data(result)}, {rms_change(figures)}'
+    if likely := rms_range_mm(result.validation, 1):
+        text += f' (95 %: {likely} mm)'
+    pixels = rms_change(figures, 'px')
+    return f'{text}, {pixels}' if pixels else text
 
 
 def rms_change(figures: Sequence[ErrorFigures], unit: str = 'mm') -> str:

@@ -39,6 +39,7 @@ from calib_ros.ros.boundary import Answer
 from calib_ros.ros.inputs import Inputs
 from calib_ros.ros.outputs import Published
 from calib_ros.sampling.account import too_much_lost
+from calib_ros.sampling.hints import Hint
 from calib_ros.sampling.sample import Sample, named
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
@@ -94,8 +95,13 @@ class Snapshot(NamedTuple):
     numbers: dict[tuple[int, str, str], int]  # the operator's, by stamp, base and tool
     origin: dict[str, Any]
     configuration: str
-    cause: str  # what looks wrong in the messages and may explain a bad fit; empty if nothing
+    hints: list[Hint]  # what looks wrong in the messages
     since: tuple[Calibration, list[Observations]] | None  # the calibration in use, and new poses
+
+    @property
+    def cause(self) -> Hint | None:
+        """Return what looks wrong in the messages and may explain a bad fit."""
+        return next((each for each in self.hints if each.explains), None)
 
     def number_of(self, one: Outlier | Step) -> int:
         """Return the operator's number of an outlier, or of the first sample after a step."""
@@ -125,20 +131,22 @@ class Identifying:
         self.last = 'nothing identified yet'  # result of the last identification or ~/load
         self.earlier = ''  # what to say of the calibration in use, if it is not of the last one
         self.observability = ''
-        self._advice = ''  # of the last identification, most serious first
+        self._short = '', '', ''
+        """Of the last answer the beginning, advice, and an end that is not cut."""
         self._report: Path | None = None  # of the last identification, if it was refused
         self._journal = archive.path  # of the poses of the last identification
 
     def snapshot(self, inputs: Inputs) -> Snapshot:
         """Return the current problem and its context."""
-        session, self._advice, self._report = self._session, '', None
+        session, self._short, self._report = self._session, ('', '', ''), None
         self._journal = self._archive.path
         try:
             problem = session.problem()
         except InputError as err:
             why = [] if session.samples else inputs.failures
-            self._advice, told = '; '.join(why), InputError('; '.join((*why, str(err))))
+            told = InputError('; '.join((*why, str(err))))
             self._failed(told)
+            self._short = '; '.join(why), '', ''
             raise told from err
         samples = tuple(session.usable)
         origin = {
@@ -155,25 +163,23 @@ class Identifying:
         lost = tuple(too_much_lost(account, largest_loss)) if session.made else ()
         texts, owners = (session.warnings, str(account)), frames.owners
         loaded = Loaded(problem, asdict(account), *texts, refusals=lost, owners=owners)
-        cause = next((sentence(hint.text) for hint in session.hints if hint.explains), '')
         since = None
         with suppress(InputError):
             since = session.since()
-        known = numbers, origin, self._configuration(), cause, since
+        known = numbers, origin, self._configuration(), session.hints, since
         found = Snapshot(loaded, session.settings, samples, *known)
         self.progress.begin()
         return found
 
     def run(self, given: Snapshot) -> Answer:
         """Identify; publish only an accepted result."""
-        loaded = given.loaded
-        self._advice = next(iter(loaded.warnings), '')  # if poses are too few
         try:
             with self.progress.running():
-                result = loaded.identified(given.settings.model, self.progress)
+                result = given.loaded.identified(given.settings.model, self.progress)
             return self._judged(given, result)
         except Exception as err:
             self._failed(err)
+            self._short = str(err), next((each.status for each in given.hints), ''), ''
             raise
 
     def _failed(self, err: Exception) -> None:
@@ -183,12 +189,16 @@ class Identifying:
         loaded = given.loaded
         steps = (step for reason in advice_of(loaded.problem, result) for step in reason.steps)
         telling = next((each.short for each in result.refusals if each.rule in TELLING_RULES), '')
-        first = next(steps, '') if telling else given.cause or next(steps, '')
+        first = brief = next(steps, '')
+        if given.cause and not telling:
+            first, brief = sentence(given.cause.text), given.cause.status
         numbers = {each: given.number_of(each) for each in result.outliers}
         self.last = words.summary(result, numbers, loaded.warnings, first)
         hint = next(iter((*loaded.warnings, *words.other_remarks(result))), '')
         moved, nearer = _moved(result, given), _nearer(result, given.since)
-        self._advice = telling or moved or nearer or first or hint
+        said, advice = words.verdict(result), moved or nearer or brief or hint
+        if telling or (moved and not result.accepted):
+            said, advice = f'{words.REFUSED}: {telling or moved}', ''
         self.observability = words.observability_in_words(result)
         scale = self._node.get_parameter('marker_scale').value
         now = self._node.get_clock().now().to_msg()
@@ -209,7 +219,9 @@ class Identifying:
                 self.last += '; the last good calibration stays in use'
             self._keep_report(page)
         row = partial(result_row, result, warnings=loaded.warnings)
-        self.last += self._filer.file(lambda: loaded.problem, given.settings, row)
+        unfiled = self._filer.file(lambda: loaded.problem, given.settings, row)
+        self._short = said, advice, KEEP * result.accepted + NOT_FILED * bool(unfiled)
+        self.last += unfiled
         return result.accepted, self.last
 
     def loaded(self, which: str) -> Answer:
@@ -237,18 +249,14 @@ class Identifying:
         if len(text) > ANSWER_LENGTH:
             path = self._archive.note(f'{text}\n', self._journal)
             path = self._report or path
-            more = f' ... full text: {path.name if path else "in the log"}'
-            kept = [each for each in (KEEP, NOT_FILED) if each in text]
-            said = text.partition(kept[0])[0] if kept else text
-            before, advice, _ = said.partition(self._advice or said)
-            if self._advice and not advice:  # it was cut off the error
-                before, advice = f'{said}; ', self._advice
-            room = ANSWER_LENGTH - len(''.join((*kept, more)))
-            if kept and not self._advice:
-                text = textwrap.shorten(said, room, placeholder=' ...')
-            else:
-                text = _without_middle(before, advice, room)
-            text = ''.join((text, *kept, more))
+            said, advice, end = self._short
+            end += f' ... full text: {path.name if path else "in the log"}'
+            longest = (ANSWER_LENGTH - len(end)) * 3 // 4
+            advice = advice and f' ... {shortened(advice, longest)}'
+            room = ANSWER_LENGTH - len(advice + end)
+            if success or advice:
+                said = textwrap.shorten(said, room, placeholder='' if advice else ' ...')
+            text = shortened(said or text, room) + advice + end
         return success, text
 
 
@@ -272,17 +280,6 @@ def _nearer(result: Identification, since: tuple[Calibration, list[Observations]
         return ''
     rms = rounded(before.figures[1].rms_mm)
     return f'the calibration before is nearer ({rms} mm): if saved, ~/load brings it back'
-
-
-def _without_middle(before: str, advice: str, longest: int) -> str:
-    """Return a text without its middle: the advice at its end stays whole, or its last clause."""
-    text = before + advice
-    last = max(text.rfind(mark) for mark in ('; ', ': ')) + 2
-    for end in (len(before) if advice else 0, last):
-        room = longest - len(text) + end - 1
-        if longest // 4 < room < end:
-            return f'{textwrap.shorten(text[:end], room, placeholder=" ...")} {text[end:]}'
-    return shortened(text, longest)
 
 
 def _page(given: Snapshot, result: Identification) -> str | None:

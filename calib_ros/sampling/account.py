@@ -11,7 +11,6 @@ from typing import Any
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.sampling.slices import JOINTS, POSES
 
-LOST = 'were dropped (stamps or full buffers)'
 ALLOW = 'accept the rest with largest_loss (--largest-loss)'
 
 
@@ -87,8 +86,9 @@ def too_much_lost(account: Account, largest_loss: float) -> list[Reason]:
     for kind, count in ((JOINTS, account.joint_states), (POSES, account.poses)):
         share, cause = lost(kind, count, account.dropped)
         if share > largest_loss:
-            text = f'{100.0 * share:.0f} % of the {kind} {LOST}; {allowing(share)}, or remove the '
-            found.append(Reason(Rule.DROPPED, f'{text}cause: {cause}'))
+            text = f'{100.0 * share:.0f} % of the {kind} were dropped: {cause}'
+            remedy = f'; remove the cause, or {allowing(share)}'
+            found.append(Reason(Rule.DROPPED, text, remedy))
     return found
 
 

@@ -14,7 +14,7 @@ from calib_ros.estimation.configurations import SCATTER, configurations, count_d
 from calib_ros.estimation.levels import FEW, NEARER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.account import LOST, Cause, lost
+from calib_ros.sampling.account import Cause, lost
 from calib_ros.sampling.dataset import lenses_by_frame
 from calib_ros.sampling.live import START, Estimate, barely_moved
 from calib_ros.sampling.sample import Sample, named
@@ -204,7 +204,7 @@ def losses(received: Mapping[str, int], dropped: Mapping[Cause, int]) -> list[Hi
     for kind in (JOINTS, POSES):
         share, cause = lost(kind, received[kind], dropped)
         if share > EXCEPTION and share * received[kind] >= NO_ACCIDENT:
-            words = f'{100.0 * share:.0f} % of the {kind} {LOST}: {cause}'
+            words = f'{100.0 * share:.0f} % of the {kind} were dropped: {cause}'
             found.append(Hint(f'{100.0 * share:.0f} % of the {kind} are dropped: {cause}', words))
     return found
 

@@ -105,7 +105,7 @@ def test_the_page_says_whether_it_is_good_enough(solved):
         assert words in verdict.heading
     shown = f'{1e3 * rms:.3f} mm ({lower:.3f} to {upper:.3f})'
     assert shown in report_of(*solved).verdict.gain
-    assert f'mm (95 %: {lower:.3f} to {upper:.3f} mm; by' in summary(result)
+    assert f'mm (95 %: {lower:.3f} to {upper:.3f} mm)' in summary(result)
     told = as_document(result, {})
     after = told['validation']['after']
     assert (after['rms_lower_mm'], after['rms_upper_mm']) == (lower, upper)

@@ -23,7 +23,7 @@ from calib_ros.files.history import History
 from calib_ros.identification.records import nominal_document
 from calib_ros.kinematics.chain_file import calibration_record, dump_chain, load_chain, parse_chain
 from calib_ros.report.advice import rules
-from calib_ros.ros.identifying import KEEP, NOT_FILED, ONE_BEFORE, _without_middle
+from calib_ros.ros.identifying import KEEP, NOT_FILED, ONE_BEFORE
 from calib_ros.ros.inputs import deserialised
 from calib_ros.sampling.batches import Stream, feed
 from calib_ros.sampling.hints import apart
@@ -58,36 +58,17 @@ def test_clocks_that_disagree_are_to_be_set_first(unsearched, cell, recording):
     assert 'synchronise the clocks' in cell.refused('identify').message
 
 
-@pytest.mark.parametrize(
-    ('verdict', 'middle', 'advice'),
-    [
-        ('NOT accepted: the poses do not determine', ' joint,' * 50, ': move the joints further'),
-        ('poses came in different frames', ' (a, b)', f': set frame_id{" to one" * 10}'),
-        ('one clause without an end', ' and so on' * 50, ''),
-    ],
-)
-def test_an_answer_is_cut_between_verdict_and_advice(verdict, middle, advice):
-    found = _without_middle('', verdict + middle + advice, 120)
-    assert len(found) <= 120
-    assert found.startswith(verdict[:25])
-    assert found.endswith(advice[2:])
-    assert ' ... ' in found
-
-
 def test_an_accepted_answer_keeps_its_hint_whole_and_says_how_to_save(cell, tmp_path):
     identifying = cell.node._identifying
     identifying._journal = tmp_path / 'ur10e_20260102T030405000006Z.csv'
     verdict, hint = 'accepted: 40 poses, RMS 1.911 -> 0.0053 mm', 'J moves one way: mix the order'
-    identifying._advice = hint
-    rest = f'valid; {"not identifiable, " * 20}note: {hint}{KEEP}{NOT_FILED}: no room'
-    _, found = identifying.shortened((True, f'{verdict} (95 %: 0.0045 to 0.006 mm); {rest}'))
-    assert len(found) <= 200
-    assert found.startswith(verdict)
-    assert f'... {hint}{KEEP}{NOT_FILED} ... full text: ' in found
-    identifying._advice = ''
-    _, found = identifying.shortened((True, f'{verdict}; {rest}'))
-    assert len(found) <= 200
-    assert f' ...{KEEP}{NOT_FILED} ... full text: ' in found
+    said, end = f'{verdict} (95 %: 0.0045 to 0.006 mm); {"valid " * 30}', KEEP + NOT_FILED
+    for advice, cut in ((hint, f' ... {hint}{end}'), ('', f' ...{end}')):
+        identifying._short = said, advice, end
+        _, found = identifying.shortened((True, 20 * said))
+        assert len(found) <= 200
+        assert found.startswith(verdict)
+        assert f'{cut} ... full text: ' in found
 
 
 @pytest.mark.parametrize('folder', ['data', 'of a cell with a long name ' * 9])
@@ -97,8 +78,9 @@ def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path,
     identifying._journal.parent.mkdir()
     reasons, figures = 'no gain on held-out poses; ' * 20, '60 poses, RMS 1 -> 2 mm; ' * 20
     for rule in Rule:
-        step = identifying._advice = rules()[rule].steps[0]
+        step = rules()[rule].steps[0]
         text = f'NOT accepted: {reasons}. To do first: {step} {figures}'
+        identifying._short = f'NOT accepted: {reasons}', step, ''
         _, found = identifying.shortened((False, text))
         assert len(found) <= 200
         assert found.startswith('NOT accepted: no gain')
@@ -109,15 +91,28 @@ def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path,
 
 def test_what_made_poses_too_few_is_in_the_answer_though_the_error_is_cut(cell, tmp_path):
     """With clocks 3 s apart it was "measure 30 or more"."""
-    identifying, hint = cell.node._identifying, apart(-3.0).text
+    identifying, hint = cell.node._identifying, apart(-3.0)
     identifying._journal = tmp_path / 'ur10e_20260102T030405000006Z.csv'
-    counts = f'2500 joint states{", dropped" * 30}; {hint}'
+    counts = f'2500 joint states{", dropped" * 30}; {hint.text}'
     text = str(TooFewObservationsError(2, 5, '6 equations each', counts))
-    assert hint not in text
-    identifying._advice = hint
+    assert hint.text not in text
+    identifying._short = text, hint.status, ''
     first, advice, _ = identifying.shortened((False, text))[1].split(' ... ')
     assert first.startswith('too few different poses: 2 measured')
-    assert hint.endswith(f': {advice}')
+    assert advice == hint.status
+
+
+@pytest.mark.parametrize('short', [('', '', ''), ('poses came in different frames' * 9, '', '')])
+def test_an_error_keeps_its_beginning_and_its_end(cell, tmp_path, short):
+    """The fault is first, the remedy last."""
+    identifying = cell.node._identifying
+    identifying._journal = tmp_path / 'ur10e_20260102T030405000006Z.csv'
+    identifying._short = short
+    text = f'poses came in different frames{" (a, b)" * 50}: set frame_id'
+    _, found = identifying.shortened((False, text))
+    assert len(found) <= 200
+    assert found.startswith('poses came in different')
+    assert ('set frame_id ... full text: ' in found) == (not short[0])
 
 
 def test_a_short_answer_names_the_mistake(cell, recording):
@@ -159,8 +154,9 @@ def test_a_refusal_leaves_its_report(unsearched, cell, recording):
     cell.play(topics(recording, measured_pose=moved))
     answer = cell.refused('identify')
     assert len(answer.message) <= 200
-    assert cell.node._identifying._advice
-    assert cell.node._identifying._advice in answer.message
+    _, advice, _ = cell.node._identifying._short
+    assert advice
+    assert f' ... {advice} ... full text: ' in answer.message
     (page,) = cell.node._archive.folder.glob('*.identified.html')
     assert answer.message.endswith(f': {page.name}')
     assert 'what to do' in page.read_text()
