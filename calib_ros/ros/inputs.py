@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -192,6 +193,12 @@ class Inputs:
 
     def _subscribe(self, stream: Stream) -> tuple[Subscription, tuple[Stream, TopicState]]:
         policies = QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH, QoSPolicyKind.HISTORY
+
+        def checked(profile: QoSProfile) -> SetParametersResult:
+            if profile.depth < 1:
+                raise ConfigError(f'the depth of qos_overrides for "{stream.topic}" must be >= 1')
+            return SetParametersResult(successful=True)
+
         try:
             name = self._node.resolve_topic_name(stream.topic)
         except rclpy_implementation.RCLError as err:
@@ -209,12 +216,10 @@ class Inputs:
                 stream,
                 stream.still,
                 lambda event: hearing.note_lost(event.total_count),
-                qos_overriding_options=QoSOverridingOptions(policies),
+                qos_overriding_options=QoSOverridingOptions(policies, callback=checked),
             )
         except RuntimeError as err:  # unknown policy
             raise ConfigError(f'qos_overrides for "{stream.topic}" cannot be: {err}') from err
-        if subscription.qos_profile.depth < 1:
-            raise ConfigError(f'the depth of qos_overrides for "{stream.topic}" must be >= 1')
         return subscription, (stream, hearing)
 
     def _subscribe_to_latched(self) -> None:

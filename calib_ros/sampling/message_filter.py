@@ -192,7 +192,8 @@ def usable(found: Part, joints: bool = False) -> tuple[Flags, Counter[str]]:
             causes[cause] += count
             good[wrong] = False
 
-    refuse(found.stamps <= 0, NO_STAMP)
+    refuse(found.stamps == 0, NO_STAMP)
+    refuse(found.stamps < 0, Lost('negative stamp (is the clock set?)'))
     if joints:
         size = np.abs(numbers).max(axis=1)
         refuse(~np.isfinite(size), 'NaN or infinite joint value')

@@ -76,6 +76,7 @@ def test_a_topic_of_another_type_is_told(cell):
         ('history', 'sometimes', 'sometimes'),
         ('history', 'unknown', 'qos_overrides for "joint_states" cannot be'),
         ('depth', 0, 'must be >= 1'),
+        ('depth', -1, 'must be >= 1'),  # it was told as an invalid allocator
         ('reliabilty', 'reliable', r'did you mean .*/joint_states.subscription.reliability'),
         ('durability', 'volatile', 'unknown parameter'),
     ],

@@ -225,17 +225,20 @@ def test_stops_at_which_the_target_still_moves_are_told(speed, stops_taken):
         assert 'set settle' in words
 
 
-@pytest.mark.parametrize(('share', 'count'), [(0.05, 0), (0.2, 1)])
-def test_much_that_is_dropped_is_told_and_why(share, count):
+@pytest.mark.parametrize(
+    ('share', 'count', 'off', 'cause'),
+    [(0.05, 0, 0, ''), (0.2, 1, 0, r'zero stamp \(fill header'), (0.2, 1, -S, 'negative stamp')],
+)
+def test_much_that_is_dropped_is_told_and_why(share, count, off, cause):
     """A driver that does not always fill its stamps loses accuracy, and the operator time."""
     made, rng = session(), np.random.default_rng(4)
-    stamp = np.where(rng.random(500) < share, 0, START + np.arange(500) * S // 50)
+    stamp = np.where(rng.random(500) < share, off, START + np.arange(500) * S // 50)
     take(made, *((TRACKER, POSE, pose(each, np.ones(3), np.eye(3))) for each in stamp.tolist()))
     take(made, of_joints(joint_state(START, UR5E.joint_names, [0.0] * 6)))
     found = told(made)
     assert len(found) == count
     if count:
-        said = r'\d\d % of the measurements were dropped: zero stamp \(fill header.stamp'
+        said = rf'\d\d % of the measurements were dropped: {cause}'
         assert re.match(said, found[0])
 
 
