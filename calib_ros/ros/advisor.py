@@ -144,9 +144,10 @@ class Guide:
         if candidates is None:
             candidates = draw_candidates(design, SOME_POSES, rng)
         candidates = _untaken(candidates, taken)
+        best, names = np.empty(0), self._session.joint_names if len(candidates) else ()
         if len(candidates):
             best = candidates[Choice(design, candidates).best(1)[0]]
-            self._next_pose.publish(to_ros.joints(self._session.joint_names, best, self._now()))
+        self._next_pose.publish(to_ros.joints(names, best, self._now()))  # none left: empty
 
     def _show(self, calibration: Calibration, world: str) -> None:
         points = survey(calibration, CLOUD, np.random.default_rng(0)).cloud

@@ -100,6 +100,8 @@ def test_the_next_pose_is_one_of_the_candidates_that_was_not_taken(tmp_path, rec
         cell.spin_until(guide._advising.done)
         cell.spin_until(lambda: heard and np.allclose(heard[-1].position, fresh, atol=1e-8))
         assert list(heard[-1].name) == names
+        guide._candidates, guide._advised = stops, ()  # the last one stayed, though it was taken
+        cell.spin_until(lambda: not heard[-1].name)
 
 
 def test_candidates_that_are_none_stop_the_start(tmp_path):
