@@ -59,12 +59,17 @@ def of_them(count: int, what: str) -> str:
 def rows_in_words(
     rows: Sequence[int], stamps_ns: NDArray[np.int64], of_messages: bool = False
 ) -> str:
-    """Return some of N measurements (N,), from 0, as text: line 2, or poses 3 to 5, 8."""
+    """Return some of N measurements (N,), from 0, as text.
+
+    That is line 2 of a table, poses 3 to 5, 8 of arrays, and the pose of a time of messages.
+    """
     lines = are_lines(stamps_ns, of_messages)
     numbers = np.take(stamps_ns // 10**9, rows) if lines else np.add(rows, 1)
-    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
-    words = [' to '.join(map(str, dict.fromkeys((run[0], run[-1])))) for run in runs]
-    return f'{"line" if lines else "pose"}{"s" * (len(rows) > 1)} {", ".join(some(words))}'
+    names = [moment(stamps_ns[k]) for k in rows] if of_messages else [*map(str, numbers)]
+    runs = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(numbers) != 1) + 1)
+    words = [' to '.join(dict.fromkeys((names[run[0]], names[run[-1]]))) for run in runs]
+    what = f'{"line" if lines else "pose"}{"s" * (len(rows) > 1)}{" of" * of_messages}'
+    return f'{what} {", ".join(some(words))}'
 
 
 def are_lines(stamps_ns: NDArray[np.int64], of_messages: bool = False) -> bool:
@@ -78,10 +83,10 @@ def is_time(stamp_ns: int) -> bool:
     return stamp_ns >= 10**17
 
 
-def moment(stamp_ns: int) -> str:
+def moment(stamp_ns: int | np.int64) -> str:
     """Return a stamp as a time, or as seconds, to a millisecond."""
-    seconds, rest = divmod(stamp_ns // 10**6, 1000)
-    if not is_time(stamp_ns):
+    seconds, rest = divmod(int(stamp_ns) // 10**6, 1000)
+    if not is_time(int(stamp_ns)):
         return f'{seconds}.{rest:03d} s'
     time = datetime.fromtimestamp(seconds, timezone.utc)
     return f'{time:%Y-%m-%d %H:%M:%S}.{rest:03d} UTC'

@@ -341,3 +341,11 @@ def test_names_of_others_stay_text_in_html():
 def test_measurements_are_called_by_their_lines_or_numbers(stamps, rows, said):
     stamps_ns = (1e9 * np.array(stamps)).astype(np.int64)
     assert rows_in_words(rows, stamps_ns) == said
+
+
+def test_measurements_of_messages_are_called_by_their_times():
+    stamps_ns = np.arange(5) * 10**9
+    assert rows_in_words([0, 1, 3], stamps_ns, True) == 'poses of 0.000 s to 1.000 s, 3.000 s'
+    assert rows_in_words([1], 17 * 10**17 + stamps_ns, True) == (
+        'pose of 2023-11-14 22:13:21.000 UTC'
+    )

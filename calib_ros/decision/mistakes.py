@@ -206,7 +206,8 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Diagnosis | 
     if found is None or len(rows) == len(seen):
         return found
     poses = rows_in_words(rows.tolist(), seen.stamps_ns, problem.of_messages)
-    among = f' of {len(seen)}' * (not are_lines(seen.stamps_ns, problem.of_messages))
+    counted = not (problem.of_messages or are_lines(seen.stamps_ns))
+    among = f' of {len(seen)}' * counted
     alike = 'write them as the others ({} reads them)'
     named = (replace(each, remedy=alike.format(each.remedy)) for each in found.suspects)
     where = f'in {poses}{among} alone, '

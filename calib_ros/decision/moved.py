@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.observations import Observations
-from calib_ros.shown import moment
+from calib_ros.estimation.problem import Problem
+from calib_ros.shown import are_lines, moment, rows_in_words
 
 FRAMES = ('base', 'tool')
 FROM_THERE = 'from there on'
@@ -20,12 +21,13 @@ class Step:
     """What moved, when and by how much.
 
     A base or tool frame, a joint, all joints or the load (`kind`: 'base', 'tool', 'joint',
-    'joints' or 'load'); `thing` names the device or target there. `set`, `sample`, its `image` and
-    `stamp_ns` belong to the first sample after the step. `size` is the RMS change of positions
-    ('m') or, if that weighs more, orientations ('rad'); of a joint that of its zero. `share` is
-    its share of the squared residuals beyond that of as many useless parameters. If all
-    measurements on one side are outliers, `unused` says which: the fit of frames is not affected.
-    If the arm's places before and after lie `apart`, its errors may look like a step of that size.
+    'joints' or 'load'); `thing` names the device or target there. `set`, `sample` and `stamp_ns`
+    belong to the first sample after the step, which a reader finds at `where`. `size` is the RMS
+    change of positions ('m') or, if that weighs more, orientations ('rad'); of a joint that of its
+    zero. `share` is its share of the squared residuals beyond that of as many useless parameters.
+    If all measurements on one side are outliers, `unused` says which: the fit of frames is not
+    affected. If the arm's places before and after lie `apart`, its errors may look like a step of
+    that size.
     """
 
     what: str
@@ -38,8 +40,7 @@ class Step:
     unit: str
     share: float
     unused: str
-    image: int | None = None
-    of_line: bool = False  # whether the stamp is a line of a table, not of a clock
+    where: str
     apart: bool = False
     held: bool = False
     """Whether a frame that the chain file holds is wrong from the first pose on."""
@@ -64,22 +65,19 @@ class Step:
         return f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
 
     def told(self, number: int) -> str:
-        """Return in short that a frame moved, for an operator of the node who counts poses so."""
+        """Return what moved in short, for an operator of the node who counts poses so."""
+        again = ', measure again after ~/clear'
+        if self.kind in OF_THE_ARM:
+            return f'{OF_THE_ARM[self.kind]} changed before pose {number}{again}'
+        what = f'the zero of {self.what}' if self.kind == 'joint' else self.what
         moved = f'moved {self._size} before pose {number}'
         if self.outdated:
-            return f'{self.what} is outdated: it {moved}, measure again after ~/clear'
-        return f'{self.what} {moved}' + ', measure again after ~/clear' * self.harmful
+            return f'{what} is outdated: it {moved}{again}'
+        return f'{what} {moved}' + again * self.harmful
 
     @property
     def reason(self) -> Reason:
         """Return the reason to refuse a result."""
-        where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
-        where += f' of set {self.set + 1}' if self.set else ''
-        when = f'stamp {moment(self.stamp_ns)}'
-        if self.of_line:
-            line = f'line {self.stamp_ns // 10**9}'
-            where = line if self.image is None else f'{where}, {line}'
-            when = 'if rows are in the order of measurement'
         size = self._size
         if self.held:
             off = f'the {self.what} held by the chain file is off {size}'
@@ -87,12 +85,12 @@ class Step:
         thing, of = self.thing, f' ({self.what})'
         if self.kind == 'joint':
             thing, of = f'the zero of {self.what}', ''
-        text, more = f'{thing} moved {size}{of} before {where}', f' ({when})'
+        text, more = f'{thing} moved {size}{of} before {self.where}', ''
         if self.slow:
             text = f'{thing} seems to have moved slowly, {size} over the session{of}'
             more = '; if the poses follow an order, errors of the arm may look so: mix them'
         elif self.kind in OF_THE_ARM:
-            text, more = f'{thing} changed before {where}', f' ({when}): poses differ {size}'
+            text, more = f'{thing} changed before {self.where}', f': poses differ {size}'
         if self.kind == 'load':
             more += '; measure with one load, or fit only the poses before or only those after'
         if self.unused:
@@ -103,6 +101,21 @@ class Step:
                 '; errors of the arm may look so, as poses before and after lie apart: mix them'
             )
         return Reason(Rule.ENCODER if self.kind.startswith('joint') else Rule.MOVED, text, more)
+
+
+def place_of(problem: Problem, number: int, sample: int) -> str:
+    """Return where a sample of a set is found: its time, its row, or its number in the set."""
+    seen = problem.sets[number]
+    stamp, what = moment(seen.stamps_ns[sample]), 'pose' if seen.pixels is None else 'image'
+    if problem.of_messages:
+        return f'the {what} of {stamp}'
+    count = sample if seen.pixels is None else seen.images[sample]
+    where = f'{what} {count + 1}' + f' of set {number + 1}' * (number > 0)
+    if not are_lines(seen.stamps_ns):
+        return f'{where} (stamp {stamp})'
+    line = rows_in_words([sample], seen.stamps_ns)
+    where = line if seen.pixels is None else f'{where}, {line}'
+    return f'{where} (if rows are in the order of measurement)'
 
 
 def thing_of(kind: str, seen: Observations) -> str:

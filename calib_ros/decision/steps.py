@@ -23,7 +23,7 @@ import numpy as np
 
 from calib_ros.decision.drift import slow_cosines
 from calib_ros.decision.imitations import LEAST, Imitation
-from calib_ros.decision.moved import FRAMES, FROM_THERE, Step, thing_of
+from calib_ros.decision.moved import FRAMES, FROM_THERE, Step, place_of, thing_of
 from calib_ros.decision.trials import largest_of
 from calib_ros.estimation.configurations import stops
 from calib_ros.estimation.fitted import Fitted
@@ -39,7 +39,6 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.settings import EXCEPTION
-from calib_ros.shown import are_lines
 
 EXPLAINED = 0.5
 """Share of the squared residuals that an explanation needs: most of them (benchmarks/harm.py)."""
@@ -359,8 +358,7 @@ class _Scan:
             unit=unit,
             share=found.share,
             unused=''.join(unused),
-            image=None if seen.pixels is None else int(seen.images[sample]),
-            of_line=are_lines(seen.stamps_ns, problem.of_messages),
+            where=place_of(problem, of_set, int(sample)),
             apart=size <= most and _separable(joints, later),
             held=not found.stop,
             slow=found.slow,

@@ -46,23 +46,28 @@ class Broadcast:
             self._base = described.frame('base').matrix
             self._tool = described.frame('tool').matrix
 
-    def publish(self, chain: Chain, world: str, in_hand: bool) -> None:
-        """Publish the frames of a calibrated chain measured in the frame `world`."""
+    def publish(self, chain: Chain, world: str, in_hand: bool, outdated: str = '') -> None:
+        """Publish the frames of a calibrated chain measured in the frame `world`.
+
+        The `outdated` one has moved since, and is left out.
+        """
         if self._publisher is None:
             return
         base, flange, target = self._names
         stands, moves = (target, world) if in_hand else (world, target)
-        found = [
-            (stands, base, chain.frame('base').matrix @ se3.invert(self._base)),
-            (flange, moves, se3.invert(self._tool) @ chain.frame('tool').matrix),
-        ]
+        found = {
+            'base': (stands, base, chain.frame('base').matrix @ se3.invert(self._base)),
+            'tool': (flange, moves, se3.invert(self._tool) @ chain.frame('tool').matrix),
+        }
         if world in ('', *self._names):  # a loop, or two parents of one frame
-            found = [] if world == target else [found[not in_hand]]
+            del found['tool' if in_hand else 'base']
+            found = {} if world == target else found
             self._node.get_logger().warning(
                 f'the measurements come in frame "{world}": /tf_static lacks it; give it a name '
                 'other than base_frame, flange_frame and target_frame'
             )
-        transforms = [self._transform(*each) for each in found if all(each[:2])]
+        found.pop(outdated, None)
+        transforms = [self._transform(*each) for each in found.values() if all(each[:2])]
         self._publisher.publish(self._type(transforms=transforms))
 
     def _transform(self, parent: str, child: str, matrix: FloatArray) -> TransformStamped:

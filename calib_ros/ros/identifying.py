@@ -82,7 +82,7 @@ ANSWER_LENGTH = LONGEST // 2
 KEEP = '; to keep it call ~/save'
 NOT_FILED = '; not filed'
 ONE_BEFORE = 'the last ~/identify has given no calibration, this is the one before it: '
-TELLING_RULES = {Rule.MISTAKE, Rule.ENCODER, Rule.DROPPED}
+TELLING_RULES = {Rule.MISTAKE, Rule.DROPPED}
 """Rules whose advice says nothing without the refusal."""
 
 
@@ -193,9 +193,10 @@ class Identifying:
         if given.cause and not telling:
             first, brief = sentence(given.cause.text), given.cause.status
         numbers = {each: given.number_of(each) for each in result.outliers}
-        self.last = words.summary(result, numbers, loaded.warnings, first)
         hint = next(iter((*loaded.warnings, *words.other_remarks(result))), '')
         moved, nearer = _moved(result, given), _nearer(result, given.since)
+        self.last = words.summary(result, numbers, loaded.warnings, first)
+        self.last += f'; {moved}' * bool(moved)
         said, advice = words.verdict(result), moved or nearer or brief or hint
         if telling or (moved and not result.accepted):
             said, advice = f'{words.REFUSED}: {telling or moved}', ''
@@ -209,7 +210,8 @@ class Identifying:
         page = partial(_page, given, result)
         if result.accepted:
             found = Calibration.of(result, given.origin, loaded.owners, loaded.problem.sets)
-            published = Published(found.dump(), given.configuration, page)
+            outdated = result.step.what if result.step and result.step.outdated else ''
+            published = Published(found.dump(), given.configuration, page, outdated)
             self._accepted(found, published, given.samples)
             self.earlier = ''
             self.last += f'; {nearer}' * bool(nearer) + KEEP
@@ -261,11 +263,11 @@ class Identifying:
 
 
 def _moved(result: Identification, given: Snapshot) -> str:
-    """Tell that a base or tool moved, if the result is accepted, or refused for that."""
+    """Tell what moved, if the result is accepted, or refused for that."""
     step, refusals = result.step, result.refusals
-    if step is None or step.kind not in FRAMES or step.slow:
+    if step is None or step.slow or (refusals and given.cause and step.kind in FRAMES):
         return ''
-    if refusals and (given.cause or refusals[0].rule is not Rule.MOVED):
+    if refusals and refusals[0].rule not in (Rule.MOVED, Rule.ENCODER):
         return ''
     return step.told(given.number_of(step))
 

@@ -38,12 +38,13 @@ class Published(NamedTuple):
     """A calibration as the text of a file, with its settings, if known.
 
     `page` makes the report of its identification, which takes a while; it returns None if that is
-    not possible.
+    not possible. The frame `outdated` moved meanwhile.
     """
 
     text: str
     configuration: str
     page: Callable[[], str | None] = lambda: None
+    outdated: str = ''
 
 
 class Keeper:
@@ -87,7 +88,8 @@ class Keeper:
             self._dh_parameters.publish(to_ros.dh_parameters(calibration.chain))
             self._calibration.publish(String(data=published.text))
             seen = to_ros.in_hand(calibration.owners)
-            self._broadcast.publish(calibration.chain, calibration.world_frame, seen)
+            where = calibration.world_frame, seen, published.outdated
+            self._broadcast.publish(calibration.chain, *where)
         self._adopted(calibration, self._world(calibration))
 
     def to_save(self) -> tuple[Published, Path | None]:

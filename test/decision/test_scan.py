@@ -11,7 +11,7 @@ from fits import NOISE, SIGMAS, UR10E, arm, at_stations, measured_arm
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.decision import steps
-from calib_ros.decision.moved import Step, thing_of
+from calib_ros.decision.moved import place_of, thing_of
 from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
@@ -19,7 +19,6 @@ from calib_ros.estimation.levels import LEAST_ASIDE, SURE
 from calib_ros.settings import EXCEPTION
 
 COUNT, AT = 60, 26
-LINE = {'stamp_ns': 7 * 10**9, 'of_line': True}
 
 
 def bumped(errors=1.0, size=1e-3, noise=NOISE, seed=3, oriented=True, gross=0, **more):
@@ -130,27 +129,28 @@ def test_a_drift_is_compared_with_priors_as_they_are_known(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ('where', 'told'),
+    ('stamp', 'more', 'told'),
     [
-        ({}, 'before pose 5 of set 2 (stamp 3.500 s)'),
-        ({'image': 2}, 'before image 3 of set 2 (stamp 3.500 s)'),
-        ({'set': 0}, 'before pose 5 (stamp 3.500 s)'),
-        ({**LINE, 'set': 0}, 'before line 7 (if rows are in the order'),
-        ({**LINE, 'image': 2}, 'before image 3 of set 2, line 7 (if rows are'),
-        ({'stamp_ns': 10**15}, 'before pose 5 of set 2 (stamp 1000000.000 s)'),
+        (3.5, {}, 'pose 5 of set 2 (stamp 3.500 s)'),
+        (1e6, {}, 'pose 5 of set 2 (stamp 1000000.000 s)'),
+        (7, {}, 'line 7 (if rows are in the order of measurement)'),
+        (7, {'of_messages': True}, 'the pose of 7.000 s'),
+        (1.7e9, {'of_messages': True}, 'the pose of 2023-11-14 22:13:20.000 UTC'),
     ],
 )
-def test_the_place_of_a_step_is_told_as_it_is_found(where, told):
-    given = {'kind': 'base', 'set': 1, 'sample': 4, 'stamp_ns': 3_500_000_000, 'image': None}
-    step = Step('base', thing='the device', size=1e-3, unit='m', share=0.9, unused='', **given)
-    assert f'moved by 1 mm (base) {told}' in str(replace(step, **where))
+def test_the_place_of_a_step_is_told_as_it_is_found(stamp, more, told):
+    """In messages by its time: a number within its set was none that an operator counts."""
+    q = UR10E.random_joints(6, np.random.default_rng(0))
+    stamps = np.full(6, round(1e9 * stamp)) - np.arange(4, -2, -1) * 10**9 * (stamp < 1e6)
+    seen = Observations.from_arrays(q, q[:, :3]).at(np.abs(stamps.astype(np.int64)))
+    assert place_of(Problem(UR10E, seen, more=(seen.changed(base='b'),), **more), 1, 4) == told
 
 
 @pytest.mark.parametrize('of_messages', [False, True])
 def test_messages_of_whole_seconds_have_no_lines(of_messages):
     """In simulated time."""
     told = str(find_step(bumped(of_messages=of_messages)))
-    assert f'before {"pose" if of_messages else "line"} {AT + 1} (' in told
+    assert f'before {"the pose of 27.000 s" if of_messages else f"line {AT + 1} ("}' in told
 
 
 def test_sets_have_their_share_of_the_freedoms_of_the_fit():
