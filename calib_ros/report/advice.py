@@ -42,7 +42,7 @@ ENOUGH = 25  # poses worth judging, and the default of `calib_ros plan`: a conve
 SPREAD_OUT = 'spread over the whole workspace, with every joint moved through most of its range'
 
 
-STEP = re.compile(r'^\d\. (?:<!-- unless (\w+) -->)?', re.MULTILINE)
+MARKED = re.compile(r'^\d\. (?:<!-- unless (\w+) -->)?', re.MULTILINE)
 
 
 @cache
@@ -53,7 +53,7 @@ def rules() -> Mapping[Rule, Advice]:
     for section in file.read_text(encoding='utf-8').split('\n## ')[1:]:
         heading, about, listed, *again = section.split('\n\n')
         name, meaning = about.removeprefix('`Rule.').split('`. ', 1)
-        _, *parts = STEP.split(listed)
+        _, *parts = MARKED.split(listed)
         steps, last = tuple(map(_unwrapped, parts[1::2])), _unwrapped(' '.join(again)) or AGAIN
         unless = tuple(parts[::2])
         found[Rule[name]] = Advice(heading, _unwrapped(meaning), steps, again=last, unless=unless)
