@@ -85,8 +85,9 @@ class TooFewObservationsError(InputError):
     def __init__(self, configurations: int, needed: int, why: str, account: str = '') -> None:
         self.configurations, self.needed, self.why = configurations, needed, why
         super().__init__(
-            f'too few different poses: {configurations} measured, at least {needed} needed '
-            f'({why}){account and f" ({account})"}; measure 30 or more, or hold parameters (fixed)'
+            f'too few different poses: {configurations} measured, at least {needed} needed ({why})'
+            f'{account and f" ({account})"}; measure {max(30, 2 * needed)} or more, or hold '
+            'parameters (fixed)'
         )
 
     def after(self, account: str) -> TooFewObservationsError:

@@ -238,10 +238,11 @@ def _require_enough(problem: Problem, names: Sequence[str]) -> None:
         rows += count * each.width
         configurations += count
     if rows < len(names):
-        width, sets = problem.observations.width, len(problem.sets)
+        widths, sets = {each.width for each in problem.sets}, len(problem.sets)
         of = f', with frames for {sets} sessions, devices or targets' if sets > 1 else ''
+        width = f'{min(widths)} to ' * (len(widths) > 1) + counted(max(widths), 'equation')
         raise TooFewObservationsError(
             configurations,
-            -(-len(names) // width),
-            f'{counted(width, "equation")} each for {len(names)} parameters{of}',
+            -(-len(names) * configurations // rows),
+            f'{width} each for {len(names)} parameters{of}',
         )
