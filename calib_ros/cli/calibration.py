@@ -62,7 +62,8 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
         if more := result.refusals[NAMED:]:
             screen.warn(f'and {len(more)} more, up to {source.places[more[-1].sample]}', 'refused')
         return common.Status.NOT_ACCEPTED
-    write_file(options.out, source.text_with(corrected), overwrite=options.force)
+    text = source.text_with(corrected).encode(source.coding)
+    write_file(options.out, text, overwrite=options.force)
     screen.say(f'wrote {options.out}: {in_words(compensator, result)}')
     screen.say(f'by {arm.whose}')
     words, warning = arm.knowledge(result.joints, result.orientation_before)

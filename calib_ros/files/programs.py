@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import csv
 import io
-from codecs import BOM_UTF8
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,13 +56,13 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
     return values
 
 
-def _columns(path: Path) -> tuple[Columns, str, str]:
-    """Return the columns of a table, the sign between its cells, and its text."""
-    text, separator = text_and_separator(path)
+def _columns(path: Path) -> tuple[Columns, str, str, str]:
+    """Return the columns of a table, the sign between its cells, its text and encoding."""
+    text, separator, coding = text_and_separator(path)
     found = require_rows(columns_of(path, text.encode(), separator=separator), ())
     if separator == ' ':
         refuse_short(found, found.header[-1])
-    return found, separator, text
+    return found, separator, text, coding
 
 
 def _program(found: Columns, chain: Chain) -> tuple[Columns, tuple[str, ...], FloatArray, Program]:
@@ -151,11 +150,12 @@ def csv_of(columns: Sequence[str], values: FloatArray) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ProgramFile:
-    """A program, the places of its samples in the file, and how to write it back."""
+    """A program, the places of its samples in the file, and how to write it in its encoding."""
 
     program: Program
     places: tuple[str, ...]
     text_with: Callable[[Program], str]
+    coding: str = 'utf-8'
 
 
 def program_of(path: Path, chain: Chain) -> ProgramFile:
@@ -182,7 +182,7 @@ def read_program(path: Path, chain: Chain) -> ProgramFile:
 
 
 def _read_csv(path: Path, chain: Chain) -> ProgramFile:
-    table, separator, text = _columns(path)
+    table, separator, text, coding = _columns(path)
     found, names, units, program = _program(table, chain)
     small = joint_columns(len(names), 's')
     signs = [each if each in found.header else each.upper() for each in small]  # beside Q1 ... Qn
@@ -191,9 +191,6 @@ def _read_csv(path: Path, chain: Chain) -> ProgramFile:
         approach = np.zeros((len(found.lines), len(signs)))
         approach[:, known] = np.sign(found.block([signs[k] for k in known]))
         program = replace(program, approach=approach)
-
-    with path.open('rb') as file:
-        mark = '\ufeff' * (file.read(3) == BOM_UTF8)
 
     def text_with(corrected: Program) -> str:
         lines = csv.reader(io.StringIO(text, newline=''), delimiter=separator)
@@ -204,9 +201,9 @@ def _read_csv(path: Path, chain: Chain) -> ProgramFile:
         for row, values in zip(rows, (corrected.positions / units[given]).tolist(), strict=True):
             for k, value in zip(at, values, strict=True):
                 row[k] = repr(value).replace('.', found.decimal)
-        return mark + csv_text([header, *rows], separator, '\r\n' if '\r\n' in text else '\n')
+        return csv_text([header, *rows], separator, '\r\n' if '\r\n' in text else '\n')
 
-    return ProgramFile(program, tuple(f'line {line}' for line in found.lines), text_with)
+    return ProgramFile(program, tuple(f'line {n}' for n in found.lines), text_with, coding)
 
 
 def _read_yaml(text: str, where: str) -> ProgramFile:

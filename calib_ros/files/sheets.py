@@ -43,6 +43,7 @@ from calib_ros.files.workbooks import sheets_of
 from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, read_bytes
 
+WESTERN = ('Windows-1252', 'Latin-1')  # the last has all bytes
 HEAD_LINES = MOST_ENTRIES // 10
 """Lines searched for the header and the first row of numbers."""
 
@@ -115,7 +116,8 @@ def read_sheet(
 
 def _of_text(path: Path, layout: Layout) -> _Content:
     text, coding = _text(path)
-    notes = [f'the text is read as {coding}'] if coding else []
+    told = f'the text is read as {coding}, because it is not UTF-8'
+    notes = [told] if coding in WESTERN else []
     if '\r' in text:
         text = text.replace('\r\n', '\n').replace('\r', '\n')
     comments: list[str] = []
@@ -226,14 +228,14 @@ def refuse_short(columns: Columns, last: str) -> None:
         )
 
 
-def text_and_separator(path: Path) -> tuple[str, str]:
-    """Return the text of a table, and the sign between its cells."""
-    text, _ = _text(path)
+def text_and_separator(path: Path) -> tuple[str, str, str]:
+    """Return the text of a table, the sign between its cells, and the encoding."""
+    text, coding = _text(path)
     separator = SEPARATORS[_separator(path, text)]
     narrow = _narrow(text, separator)
     if separator in narrow.lstrip().partition('\n')[0]:
-        return narrow, separator
-    return text, ','  # the header lacks it: it is in the words below
+        return narrow, separator, coding
+    return text, ',', coding  # the header lacks it: it is in the words below
 
 
 def _narrow(text: str, separator: str) -> str:
@@ -286,10 +288,11 @@ def _over_groups(cells: Sequence[str], width: int) -> list[str]:
 
 
 def _text(path: Path) -> tuple[str, str]:
+    """Return the text of a table and its encoding, by which all of its bytes are written again."""
     data = read_bytes(path, LARGEST_TABLE, InputError)
     if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         try:
-            return data.decode('utf-16'), ''
+            return data.decode('utf-16'), 'utf-16'
         except UnicodeDecodeError as err:
             raise InputError(f'cannot read {path}: {err}') from err
     if b'\0' in data:
@@ -297,9 +300,11 @@ def _text(path: Path) -> tuple[str, str]:
         if path.suffix.lower() in SHEETS:
             told = 'is a workbook, expected a table as text: save the sheet as CSV'
         raise InputError(f'cannot read {path}: it {told}')
-    with suppress(UnicodeDecodeError):
-        return data.decode('utf-8-sig'), ''
-    return data.decode('cp1252', errors='replace'), 'Windows-1252, because it is not UTF-8'
+    marked = data.startswith(codecs.BOM_UTF8)
+    for coding in ('utf-8-sig' if marked else 'utf-8', *WESTERN[:-1]):
+        with suppress(UnicodeDecodeError):
+            return data.decode(coding), coding
+    return data.decode(WESTERN[-1]), WESTERN[-1]
 
 
 def _separator(path: Path, text: str) -> str:
