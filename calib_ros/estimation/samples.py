@@ -85,7 +85,7 @@ class Samples:
             if (np.diff(folds) < 0).any():
                 samples = self.select(np.argsort(folds, kind='stable'))
         model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
-        effects = np.arange(len(names))[model.spread]
+        effects = model.spread
         by_motion = np.argsort(model.order[effects], kind='stable')
         motions, place = model.order[effects[by_motion]], np.append(model.order, -1)
         place[:-1] += len(effects)

@@ -25,12 +25,11 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics.joint import Frame, Joint
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray, Index, cross
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray, Index, cos_sin, cross
 from calib_ros.kinematics.walk import Walk
 
 
@@ -165,44 +164,19 @@ def basis(
     `approach` (n, B) holds the signs of the preceding velocities; without it there is no backlash.
     """
     phi = np.zeros((len(names), q.shape[1]))
-    if not names:
-        return phi
     q = couple_held(chain, q)
-    circles: dict[int, NDArray[np.complex128]] = {}
     for kind, (rows, joints, others) in _by_kind(tuple(names), chain.joint_names).items():
         if kind == 'ratio':
             phi[rows] = q[joints]
         elif kind == 'coupling':
             phi[rows] = q[others.astype(int)]
         elif kind in WAVES:
-            for joint in np.unique(joints).tolist():
-                own = np.flatnonzero(joints == joint)
-                wave = _wave(q[joint], others[own], circles, joint)
-                phi[rows[own]] = wave.imag if kind == 'sin' else wave.real
+            phi[rows] = cos_sin(others[:, np.newaxis] * q[joints])[kind == 'sin']
         elif kind in PLAY and approach is not None:
             phi[rows] = approach[joints]
         elif kind in ('gravity', 'compliance'):
             phi[rows] = _torques(chain, q, joints, others if kind == 'gravity' else None)
     return phi
-
-
-def _wave(
-    q: FloatArray, orders: FloatArray, circles: dict[int, NDArray[np.complex128]], joint: int
-) -> NDArray[np.complex128]:
-    """Return exp(i k q) (K, B) of orders k (K,) at the values (B,) of a joint.
-
-    From powers of exp(i q), cached in `circles`, if most orders up to the highest are needed.
-    """
-    highest, whole = int(orders.max()), (orders == np.round(orders)) & (orders > 0.0)
-    if 2 * len(orders) <= highest or not whole.all():
-        return np.asarray(np.exp(1j * orders[:, np.newaxis] * q))
-    turn = circles.get(joint)
-    if turn is None or len(turn) < highest:
-        turn = circles[joint] = np.empty((highest, len(q)), dtype=np.complex128)
-        np.exp(1j * q, out=turn[0])
-        for row in range(1, highest):
-            np.multiply(turn[row - 1], turn[0], out=turn[row])
-    return np.asarray(turn[orders.astype(int) - 1])
 
 
 def couple_held(
@@ -234,8 +208,6 @@ def moved_joints(chain: _Arm, names: Sequence[str], phi: FloatArray, q: FloatArr
     known = dict(chain.effects)
     values = [known[name] for name in names]
     q = couple_held(chain, q, couplings=False)
-    if not any(values):
-        return q
     shares = np.zeros((len(q), len(names)))
     shares[_driven(tuple(names), chain.joint_names), np.arange(len(names))] = values
     return np.asarray(q + shares @ phi)

@@ -72,7 +72,7 @@ class ErrorModel:
         """Row of each named parameter in the arrays of `linearise`; of effects, to be multiplied
         by phi."""
         self.spread = self._layout.spread
-        """Numbers (E,) of the effects among the names, or a slice."""
+        """Numbers (E,) of the effects among the names."""
 
     def linearise(
         self,
@@ -129,7 +129,7 @@ class ErrorModel:
         if self._layout.beside:
             after = frames[behind, :3]
             frames[count + 3 :, 1] = np.einsum('jk,jkcb->jcb', walk.beside, after)
-        if self._layout.bent and walk.beta.any():  # a and alpha come before beta
+        if walk.beta.any():  # a and alpha come before beta
             frames[behind, 0] *= walk.cos[:, np.newaxis, np.newaxis]
             frames[behind, 0] += walk.sin[:, np.newaxis, np.newaxis] * frames[behind, 2]
         return frames, target
@@ -170,9 +170,9 @@ class _Layout(NamedTuple):
 
     Of the rows of all frames, four each, `turns` and `points` belong to rotations, `shifts` to the
     others; `still` ones move nothing, `unturned` are the rotations among them. `behind` are the
-    frames after the constant part of each link, `bent` if something moves along or about x there,
-    `beside` if b does along y before it. `effects`, with numbers `spread` among the names, share
-    the columns of the motion of their `joints`; `delay` is the row of a delay.
+    frames after the constant part of each link, `beside` if b moves along y before it. `effects`,
+    with numbers `spread` among the names, share the columns of the motion of their `joints`;
+    `delay` is the row of a delay.
     """
 
     rotations: int
@@ -183,10 +183,9 @@ class _Layout(NamedTuple):
     still: Index
     unturned: Index
     behind: slice
-    bent: bool
     beside: bool
     effects: tuple[str, ...]
-    spread: Index | slice
+    spread: Index
     joints: Index
     delay: int | None
 
@@ -248,10 +247,9 @@ def _layout(
         _indices(still),
         _indices(k for k in still if k < rotations),
         slice(1, len(joints) + 1) if standard else slice(0, len(joints)),
-        any(Parameter(name).kind in ('a', 'alpha') for name in names),
         any(Parameter(name).kind == 'b' for name in names),
         fitted,
-        _span([k for k, name in enumerate(names) if name in own]),
+        _indices(k for k, name in enumerate(names) if name in own),
         _indices(own.values()),
         row.get(Parameter(ends[0], DELAY)),
     )
@@ -275,12 +273,6 @@ def _indices(numbers: Iterable[int]) -> Index:
     found = np.array([*numbers], dtype=np.intp)
     found.setflags(write=False)
     return found
-
-
-def _span(numbers: list[int]) -> Index | slice:
-    """Return ascending numbers as a slice if they are successive: faster than indices."""
-    first, last = (numbers[0], numbers[-1] + 1) if numbers else (0, 0)
-    return slice(first, last) if last - first == len(numbers) else _indices(numbers)
 
 
 def orientation_error(measured: FloatArray, model: FloatArray) -> FloatArray:
