@@ -12,7 +12,7 @@ from calib_ros.apply import simulation
 from calib_ros.apply.chart import drift, run_length
 from calib_ros.apply.confidence import judge, rms_interval
 from calib_ros.apply.verification import verify
-from calib_ros.errors import InputError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.se3 import invert
 
 
@@ -56,6 +56,12 @@ def test_errors_that_grow_after_a_better_calibration_are_found():
     assert drift(rms[:30], np.full(30, 30.0), 100.0).alarms == ()
 
 
+def test_a_lucky_night_does_not_make_the_next_ones_bad():
+    rms = np.ones(30)
+    rms[20] = 0.2
+    assert drift(rms, np.full(30, 30.0), 100.0).alarms == ()
+
+
 def test_what_are_no_errors_is_refused():
     for rms, freedom in (([0.1, -0.1], [3.0, 3.0]), ([0.1], [3.0, 3.0]), ([0.1], [0.0])):
         with pytest.raises(InputError, match='degrees of freedom of nights'):
@@ -72,6 +78,7 @@ def test_a_pose_measured_again_and_again_tells_no_more(most):
         lower, upper = rms_interval(errors[group], group)
         held.append(lower <= truth <= upper)
     assert np.mean(held) > 0.93
+    assert rms_interval(np.ones((2, 3)), np.zeros(2, dtype=int)) == (0.0, np.inf)  # of one pose
 
 
 @pytest.mark.parametrize('repeats', [1, 30])
@@ -98,3 +105,5 @@ def test_node_and_command_judge_by_one_rule(arm, repeats):
                 assert getattr(node, name) == getattr(command, name)
         once = verify(of, [seen] if len(sets) == 1 else [seen.select(np.arange(4)), other], None)
         assert (node.rms, node.upper) == pytest.approx((once.rms, once.upper))
+    with pytest.raises(ConfigError, match='at least one set of Observations'):
+        verify(arm, [], None)

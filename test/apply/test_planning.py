@@ -130,6 +130,12 @@ def test_wrong_arguments_are_refused():
     for in_degrees in (np.degrees(q), q), (q, np.degrees(q)):
         with pytest.raises(InputError, match=r'\[0, .*beyond the limits of .*not degrees'):
             planning.plan(design, *in_degrees, 5)
+    for nothing in (q[:0], q), (q, q[:0]):
+        with pytest.raises(InputError, match='a plan needs candidates, and at least one pose'):
+            planning.plan(design, *nothing, 5)
+    for speeds in (np.ones(1), np.append(np.zeros(1), np.ones(len(q.T) - 1))):
+        with pytest.raises(ConfigError, match=r'velocities must be \d positive numbers'):
+            planning.plan(design, q, q, 5, velocities=speeds)
 
 
 def measured_problem(name, session):

@@ -1,9 +1,12 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calib_ros.apply.simulation import Camera, Cell, _facing, before_camera, drive, photograph
+from calib_ros.errors import InputError
 from calib_ros.kinematics.chain_file import load_chain
 
 
@@ -32,6 +35,15 @@ def test_boards_stand_in_the_view_of_a_camera_as_far_away_as_said(rng):
         pixels.reshape(10, 4, 2)[:, 0] - pixels.reshape(10, 4, 2)[:, 3], axis=1
     )
     assert 0.35 < across.mean() / np.hypot(camera.width, camera.height) < 0.65  # about half of it
+
+
+def test_a_camera_out_of_reach_is_refused(rng):
+    points, camera = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]), Camera()
+    chain = before_camera(load_chain('ur5e'), camera, points, False, rng)
+    far = chain.frame('base')
+    chain = chain.with_frame('base', replace(far, matrix=far.matrix + 9.0 * np.eye(4, k=3)))
+    with pytest.raises(InputError, match='of 40 places before the camera the arm reaches 0, exp'):
+        photograph(chain, camera, points, False, 20, rng, tries=40)
 
 
 def test_a_simulated_lens_bends_the_corners_of_its_pictures_a_little():

@@ -48,6 +48,8 @@ def bad_inputs():
     yield 'growth', (*good, '--growth', '30'), '--growth needs --previous'
     for alone in (('--board', 'b'), ('--places', 'p'), ('--intrinsics', 'i'), ('--lens', 'given')):
         yield f'{alone[0]} alone', (*good, *alone), f'{alone[0]} needs --detections'
+    yield 'corners of nothing', (*bag_of, '--detections', 'c.csv'), '--detections needs --board\n'
+    yield 'no serial', (*good, '--history', 'h'), '--history files results by serial number: add'
     yield 'a layout of nothing', (*good, '--joints-preset', 'kuka'), ' needs --joints'
     of_bag = (*bag_of, 'folder', '--joints-preset', 'kuka')
     yield 'a layout of nothing, beside a bag', of_bag, '--joints-preset needs --joints'

@@ -71,6 +71,11 @@ def test_arrays_that_cannot_be_are_refused(arrays, complaint):
         Observations.from_arrays(*arrays)
 
 
+def test_a_plane_needs_heights():
+    with pytest.raises(InputError, match='a plane needs the heights over it as distances'):
+        replace(Observations.from_arrays(SIX, THREE), plane=True)
+
+
 def test_observations_do_not_follow_arrays_that_change():
     joints = SIX.copy()
     seen = Observations.from_arrays(joints, THREE)

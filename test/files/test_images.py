@@ -231,9 +231,7 @@ def test_joints_that_the_arm_does_not_have_are_told(tmp_path):
 def test_intrinsics_as_camera_calibration_writes_them(tmp_path):
     path = tmp_path / 'camera.yaml'
     path.write_text(INTRINSICS)
-    lens = lenses.read_lens(path)
-    assert (lens.fx, lens.fy, lens.cx, lens.cy) == (1352.02747, 1356.14287, 789.67065, 627.2995)
-    assert (lens.k1, lens.p2, lens.fixed) == (0.0, 0.0, True)
+    assert lenses.read_lens(path) == Lens(1352.02747, 1356.14287, 789.67065, 627.2995)
 
 
 def test_intrinsics_of_other_images_are_refused(tmp_path):
@@ -269,6 +267,10 @@ def test_intrinsics_as_others_write_them(tmp_path):
         path.write_text(f'{text}distortion_coefficients: [[-0.1, 0.2, 0, 0, 0]]\n')
         lens = lenses.read_lens(path)
         assert (lens.fx, lens.cy, lens.k1, lens.k2) == (1350.0, 605.0, -0.1, 0.2)
+    for text in ('5', 'camera_matrix: wide', 'distortion_coefficients: [0]'):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match='as camera_calibration writes it'):
+            lenses.read_lens(path)
 
 
 def test_the_virtual_arm_is_where_the_flange_is(rng):

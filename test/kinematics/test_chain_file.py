@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import os
 import re
 from pathlib import Path
 
@@ -241,8 +242,14 @@ def test_a_shipped_robot_stands_where_another_source_says(robot):
     assert turn.max() <= 1e-8
 
 
-def test_every_shipped_robot_is_read():
+def test_every_shipped_robot_is_read(tmp_path, monkeypatch):
     robots = shipped_robots()
+    monkeypatch.chdir(tmp_path)  # no prefix is the folder one happens to be in
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{os.pathsep}{tmp_path / "none"}')
+    there = tmp_path / 'share/calib_ros/config/robots'
+    there.mkdir(parents=True)
+    (there / 'ur10e.yaml').write_text(UR)
+    assert shipped_robots() == robots
     assert robots.keys() >= GOLDEN.keys()
     for name in robots:
         chain = load_chain(name)

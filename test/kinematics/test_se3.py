@@ -16,6 +16,8 @@ def test_the_angle_between_rotations_is_that_of_their_difference():
     first = se3.exp_rotation(rng.normal(size=(4, 3)))
     found = se3.angles_between(first, first @ se3.exp_rotation(vectors))
     np.testing.assert_allclose(found, np.linalg.norm(vectors, axis=1), atol=3e-8)
+    many = se3.exp_rotation(rng.normal(size=(1000, 3)))  # a cosine may be rounded to more than 1
+    assert se3.angles_between(many, many).max() < 1e-7
 
 
 @pytest.mark.parametrize('angle', [0.0, 1e-9, 1e-4, 0.3, 2.0, 3.1])

@@ -120,6 +120,8 @@ def test_common_normals_take_in_b_and_beta(convention, b, beta, left):
     assert found.forward(q) == pytest.approx(chain.forward(q), abs=1e-12)
     assert max(abs(joint.b) for joint in found.joints) == 0.0
     assert max(abs(joint.beta) for joint in found.joints) <= left
+    plain = load_chain('kuka_youbot')  # with d between parallel axes
+    assert with_common_normals(plain).joints == plain.joints
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
@@ -321,6 +323,8 @@ def test_a_tip_of_usual_name_is_found_behind_a_prefix():
     assert chain_from_urdf(text).tool.matrix == pytest.approx(
         chain_from_urdf(UR10E).tool.matrix, abs=1e-12
     )
+    flange = chain_from_urdf(text.replace('r1_tool0', 'r1_end')).tool.matrix  # the next usual one
+    assert flange == pytest.approx(chain_from_urdf(UR10E, tip_link='flange').tool.matrix)
 
 
 def test_a_wrong_link_names_the_right_ones():
