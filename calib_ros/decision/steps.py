@@ -44,15 +44,16 @@ EXPLAINED = 0.5
 """Share of the squared residuals that an explanation needs: most of them (benchmarks/harm.py)."""
 
 
-def find_step(fitted: Fitted, held: bool = False) -> Step | None:
+def find_step(fitted: Fitted) -> Step | None:
     """Return the step that explains more than half of the residuals of a fit, if any.
 
-    None if the arm is `held`, and another load from the first pose on explains them.
+    Of those beside a load from the first pose on, if that alone explains more than the step.
     """
-    if held and _Scan(fitted, loaded=True, gross=True).explained:
-        return None
     scan, found = _searched(fitted, loaded=False)
-    bends = found is None and fitted.noise.position >= SUSPICIOUS
+    if found is None:
+        bends = fitted.noise.position >= SUSPICIOUS
+    else:
+        bends = _Scan(fitted, True, scan.gross).variance < found.variance
     if bends:
         scan, found = _searched(fitted, loaded=True)
     if found is not None:
@@ -130,7 +131,7 @@ class _Scan:
 
     def __init__(self, fitted: Fitted, loaded: bool, gross: bool) -> None:
         problem, names, robust = fitted.problem, fitted.names, fitted.robust
-        self._problem, self._chain = problem, robust.fit.chain
+        self._problem, self._chain, self.gross = problem, robust.fit.chain, gross
         self._groups = _groups(problem) + (_of_the_arm(problem) if loaded else [])
         constant = [n for g in self._groups if g.kind == 'load' for n in g.names if n not in names]
         self._chain = self._chain.with_effects(constant)
@@ -173,6 +174,7 @@ class _Scan:
         back = extra @ left[[*range(self._fitted), -1]]  # a step may spare priors much
         equations = float(self._equations.sum() + extra[:, :-1].any(axis=1).sum())
         self._all = float(self._left.sum() + back @ back), equations - self._fitted
+        self.variance = self._all[0] / max(self._all[1], 1.0)
         usual = bool(self._left.sum() < SUSPICIOUS**2 * self._equations.sum())
         self.explained = bool(constant) and usual and fitted.noise.position >= SUSPICIOUS
 

@@ -258,7 +258,7 @@ class Calibration(Shown):
             fitted = fit(Problem(chain, sets[0], more=tuple(sets[1:]), fixed=arm))
         except InputError:  # too few for frames of their own
             return None
-        found = find_step(fitted, held=True)
+        found = find_step(fitted)
         return found and replace(found, unused='')  # here every measurement counts
 
     def require_frames(self, sets: Sequence[Observations]) -> None:
