@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, groupby
 from typing import Any
@@ -160,6 +160,11 @@ class Information(Shown):
         left = (root @ (axes / np.sqrt(np.maximum(values, 1.0)))).T
         return left.T @ (left @ self.vector), left.T @ left
 
+    def evidence(self, root: FloatArray) -> float:
+        """Return the log evidence of changes with the prior N(0, root root^T)."""
+        whole, seen = np.eye(root.shape[1]) + root.T @ self.matrix @ root, root.T @ self.vector
+        return 0.5 * float(seen @ np.linalg.solve(whole, seen) - np.linalg.slogdet(whole)[1])
+
     def explained(self, columns: FloatArray) -> tuple[float, FloatArray, FloatArray, int]:
         """Return gain, changes, their covariance and its rank for columns (P, k)."""
         inner = columns.T @ self.matrix @ columns
@@ -257,11 +262,6 @@ def likelier(
     return found
 
 
-def _sizes(names: Sequence[Parameter]) -> FloatArray:
-    known = SIZES | {SCALE_OF_DEVICE.unit: SCALE}
-    return np.array([known.get(name.unit) or expected(name) for name in names])
-
-
 class ChangeColumns:
     """Effects of an arm's changes on the P parameters `names` with information.
 
@@ -329,25 +329,28 @@ class ChangeColumns:
         """Return the columns (P, k) of k parameters."""
         return np.array([self._columns[name] for name in names]).T
 
+    def root(self, times: Mapping[Parameter, float]) -> FloatArray:
+        """Return a root (P, k) of the covariance of changes so many typical ones large."""
+        known = SIZES | {SCALE_OF_DEVICE.unit: SCALE}
+        sizes = [(known.get(n.unit) or expected(n)) * each for n, each in times.items()]
+        return self.of([*times]) * sizes
+
     def evidence(
         self, information: Information, names: Sequence[Parameter]
     ) -> tuple[float, float]:
         """Return the log evidence of changes of k parameters, and how many typical ones."""
-        columns, sizes, found = self.of(names), _sizes(names), []
-        stiff = [name.of_dh and name not in self.zeros for name in names]
+        found = []
         for k in range(SEVERAL):
-            scaled = columns * sizes * SPREAD ** np.where(stiff, min(k, 1), k)
-            whole = np.eye(len(names)) + scaled.T @ information.matrix @ scaled
-            seen = scaled.T @ information.vector
-            gain = float(seen @ np.linalg.solve(whole, seen))
-            found.append((0.5 * (gain - float(np.linalg.slogdet(whole)[1]) - k**2), SPREAD**k))
+            few = min(k, 1)
+            times = {n: SPREAD ** (few if n.of_dh and n not in self.zeros else k) for n in names}
+            found.append((information.evidence(self.root(times)) - 0.5 * k**2, SPREAD**k))
         return max(found)
 
     def spread(self, changed: Sequence[Sequence[Explanation]]) -> FloatArray:
         """Return the prior covariance (P, P) of changes whose sizes the data determine."""
         found = np.zeros((self._count, self._count))
         for each in (each for reasons in changed for each in reasons):
-            root = self.of(each.names) * (max(SPREAD, each.times) * _sizes(each.names))
+            root = self.root(dict.fromkeys(each.names, max(SPREAD, each.times)))
             found += root @ root.T
         return found
 

@@ -36,7 +36,7 @@ class Recalibration(Shown):
     joint range, `moved` is their change. `reused` is the share of poses that the earlier
     calibration was fitted to: they would count twice. `fitted_mm` is the RMS error of the new
     poses by the updated one. `odd` names a pose without which the others would be accepted, `step`
-    tells what moved while they were measured.
+    tells what moved while they were measured. `another` robot is likelier than the changes.
     """
 
     calibration: Calibration
@@ -50,6 +50,7 @@ class Recalibration(Shown):
     fitted_mm: float = 0.0
     odd: str = ''
     step: Step | None = None
+    another: bool = False
 
     @property
     def before(self) -> ErrorFigures:
@@ -66,8 +67,13 @@ class Recalibration(Shown):
         """Tell whether the result may be used."""
         most = max(ALIKE * self.before.rms_mm, 1e3 * SAME)  # simulated without noise
         agrees = self.after.rms_mm <= min(most, 1e3 * Settings.largest_error)
-        fits = self.unexplained > changes.FALSE_ALARM and agrees
-        return fits and self.determined and not (self.reused or self.outside)
+        doubted = self.reused or self.outside or self.another
+        return self.explained and agrees and self.determined and not doubted
+
+    @property
+    def explained(self) -> bool:
+        """Tell whether no more is left of the new poses than by chance."""
+        return self.unexplained > changes.FALSE_ALARM
 
     @property
     def determined(self) -> bool:
@@ -93,13 +99,17 @@ class Recalibration(Shown):
         return self.outside is not None and self.outside.owner != changes.LOAD
 
     @property
+    def far(self) -> bool:
+        """Tell whether the new poses are further off than any arm."""
+        return self.before.rms_mm > 1e3 * Settings.largest_error
+
+    @property
     def perhaps_moved(self) -> bool:
         """Tell whether a single frame moved far away may look like several changes, or like none.
 
         So far from the earlier arm the linear model of changes does not hold.
         """
-        far = self.before.rms_mm > 1e3 * Settings.largest_error and not self.reused
-        return far and (len(self.changed) > 1 or self.unexplained <= changes.FALSE_ALARM)
+        return self.far and not self.reused and (len(self.changed) > 1 or not self.explained)
 
     def with_moved(self, frame: str, earlier: Chain, found: Recalibration) -> Recalibration:
         """Return the result, fitted with a free `frame`, that names this frame as the change.
@@ -150,7 +160,10 @@ class Recalibration(Shown):
         if self.odd:
             why = f'{self.odd} contradicts all others: without it they would be accepted'
             return why, 'measure it again, or leave it out'
-        if (cause := self.outside) and self.unexplained > changes.FALSE_ALARM:
+        if self.another and not self.step and (self.explained or not self.far):
+            why = 'the new poses are rather those of another robot of the same type'
+            return why, f'check whose they are; if this robot was repaired, {ANEW}'
+        if (cause := self.outside) and self.explained:
             if not self.out_of_scale:
                 why = 'the arm bends as under another load than in the earlier calibration'
                 return why, f'measure with that load, or, with this one, {ANEW}'
@@ -162,9 +175,9 @@ class Recalibration(Shown):
         if self.step:
             why = f'something moved while the new poses were measured: {self.step}'
             return why, 'measure again, or give only the poses from there on'
-        if self.unexplained <= changes.FALSE_ALARM:
+        if not self.explained:
             step = ANEW
-            if self.before.rms_mm > 1e3 * Settings.largest_error:
+            if self.far:
                 step = (
                     'if the device or the target was moved, give --new-base or --new-tool; check '
                     f'units, columns and rows of the measurements; else {step}'

@@ -24,6 +24,7 @@ import numpy as np
 
 from calib_ros.annotated import NotNegative, as_annotated
 from calib_ros.decision import changes, mistakes
+from calib_ros.decision.another import is_another
 from calib_ros.decision.changes import SCALE_OF_DEVICE, ChangeColumns, Explanation, Information
 from calib_ros.decision.comparison import Comparison, compare, residuals
 from calib_ros.decision.validation import fold_residuals
@@ -97,7 +98,7 @@ def recalibrate(
             held_out = 'held-out ' if number >= len(problem.sets) else ''
             name = rows_in_words([pose], seen.stamps_ns, problem.of_messages)
             return replace(found, odd=f'{held_out}{name}{where}')
-    if found.unexplained <= changes.FALSE_ALARM:
+    if not found.explained:
         if mistake := mistakes.diagnose_alone(problem, arm):
             raise InputError(f'the new poses do not fit the arm: {mistake}')
         return replace(found, step=previous.step(problem.all_sets))
@@ -158,6 +159,7 @@ def _recalibrated(
             break
     expected, _ = found.information.mean(changes.root_of(arm.doubted))
     left = found.squares - float(found.information.vector @ expected)
+    left_over = found.information.marginalised(then.doubted)
     updated = _updated(arm, found, problem, changed)
     result = Recalibration(
         updated,
@@ -167,6 +169,7 @@ def _recalibrated(
         *_rms_positions(arm, then.square, found),
         previous.reused(sets),
         compare(earlier, updated.chain, sets).figures[1].rms_mm,
+        another=is_another(left_over, columns, changed, previous.chain, previous.before),
     )
     record = {**updated.record, 'accepted': result.accepted}
     return replace(result, calibration=replace(updated, record=record)), earlier
