@@ -18,7 +18,7 @@ from calib_ros.files.history import History
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.run import Run, results, too_late, verifications
-from calib_ros.fleet.watch import Watched, watch
+from calib_ros.fleet.watch import Watched, alarms_of, watch
 from calib_ros.report.page import State
 from calib_ros.shown import counted, some
 
@@ -92,7 +92,7 @@ class RobotStatus:
             f'{self.verified[first].time:%Y-%m-%d}: the errors of its verifications have grown'
             for first in self.drift.since
         )
-        return (*(f'{each.time:%Y-%m-%d}: {each}' for each in self.watched.changes), *grown)
+        return (*alarms_of(self.watched.changes), *grown)
 
     @property
     def actions(self) -> tuple[str, ...]:

@@ -25,8 +25,9 @@ nights scatter CLEARLY more: if every joint and pair leaves more, several change
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import combinations
@@ -43,7 +44,7 @@ from calib_ros.decision.changes import (
     reason_in_words,
     reasons_of,
 )
-from calib_ros.estimation.levels import CLEARLY, KNOWN, TELLING, chance_of
+from calib_ros.estimation.levels import CLEARLY, KNOWN, SEVERAL, TELLING, chance_of
 from calib_ros.files.rows import Row
 from calib_ros.identification.age import YEAR, drift_of
 from calib_ros.kinematics.parameter import Parameter
@@ -73,6 +74,33 @@ class Change:
                 'another robot?'
             )
         return f'{reason_in_words(self.reasons)}: was it bumped?'
+
+    @property
+    def alone(self) -> dict[tuple[Parameter, float], float]:
+        """Return the change [m, rad] of each parameter that may explain it alone, by its sign."""
+        single = ((e.names[0], float(e.change[0])) for e in self.reasons if len(e.names) == 1)
+        return {(name, math.copysign(1.0, change)): change for name, change in single}
+
+
+def alarms_of(changes: Sequence[Change]) -> Iterator[str]:
+    """Yield changes with their dates; SEVERAL of one parameter and sign in a row are creep."""
+    runs: list[list[Change]] = [[]]
+    for each in changes:
+        if not set(each.alone).intersection(*(one.alone for one in runs[-1])):
+            runs.append([])
+        runs[-1].append(each)
+    for run in filter(None, runs):
+        shared = set(run[0].alone).intersection(*(each.alone for each in run))
+        if not shared or len(run) < SEVERAL:
+            yield from (f'{each.time:%Y-%m-%d}: {each}' for each in run)
+            continue
+        factor, unit = min(shared)[0].small_unit
+        size = factor * sum(each.alone[min(shared)] for each in run)
+        names = ' or '.join(sorted(name for name, _ in shared))
+        yield (
+            f'{run[0].time:%Y-%m-%d}: {names} creeps: by {size:+.3f} {unit} in {len(run)} changes '
+            f'up to {run[-1].time:%Y-%m-%d}: is it worn or loose?'
+        )
 
 
 class Night(NamedTuple):

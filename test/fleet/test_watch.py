@@ -3,6 +3,7 @@
 """Changes between nights, on results drawn from the covariance of a real identification."""
 
 import json
+import re
 from dataclasses import replace
 from datetime import timedelta
 
@@ -13,7 +14,7 @@ import pytest
 from calib_ros.apply import simulation
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.rows import Filing, result_row
-from calib_ros.fleet.watch import watch
+from calib_ros.fleet.watch import alarms_of, watch
 from calib_ros.identification.age import drift_of
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import chain_document, load_chain
@@ -126,6 +127,23 @@ def test_a_drift_that_no_night_shows_is_found(first, rng, per_year, count):
     assert changes
     for change in changes:
         assert 'wrist_1_joint' in {reason.owner for reason in change.reasons}
+
+
+def test_changes_of_one_parameter_in_one_direction_are_told_as_creep(first, rng):
+    """They were up to 25 bumps, one by one."""
+    rows = nights(first, rng, 40, (10, BUMPS[2]))
+    slope = 2e-5 * (np.array(first.names) == BUMPS[0])
+    rows = [
+        replace(row, offsets=row.offsets + slope * max(0, k - 12)) for k, row in enumerate(rows)
+    ]
+    changes = watch(rows, 100.0).changes
+    told = list(alarms_of(changes))
+    assert len(changes) > len(told) == 2
+    assert 'wrist_2_joint.alpha by' in told[0]
+    assert told[0].endswith('was it bumped?')
+    assert re.fullmatch(
+        r'2025-10-\d\d: elbow_joint.theta creeps: by \+0.[45]\d+ mrad in .*', told[1]
+    )
 
 
 def test_the_usual_drift_is_no_event_and_hides_none(first, rng):
