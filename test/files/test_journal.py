@@ -10,7 +10,7 @@ from hypothesis import given, strategies as st
 
 from calib_ros.errors import InputError
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.journal import Journal, read_journal, table_text
+from calib_ros.files.journal import Journal, is_whole, read_journal, table_text
 from calib_ros.files.layouts import Layout
 from calib_ros.files.measurements import view_of
 from calib_ros.files.tables import read_table
@@ -22,6 +22,13 @@ JOINTS = 3
 floats = st.floats(-1e6, 1e6)  # what a session takes
 vectors = st.lists(floats, min_size=JOINTS, max_size=JOINTS).map(np.array)
 names = st.text(st.characters(exclude_categories=['C', 'Z'], include_characters=' '), max_size=8)
+
+
+@pytest.mark.parametrize(
+    ('row', 'whole'), [(b'1,2,', 1), (b'1,2', 0), (b'1,2,0.5 0.', 0), (b'1,\0,', 0), (b'1,', 0)]
+)
+def test_a_row_is_whole_if_only_its_line_end_may_be_missing(row, whole):
+    assert is_whole(row, 3) == whole
 
 
 def rotation(seed):

@@ -63,8 +63,8 @@ def test_every_preset_says_where_its_format_is_documented():
 
 def test_presets_of_users_and_their_faults(tmp_path):
     path = tmp_path / 'mine.yaml'
-    path.write_text('length: mm\ncolumns: {x: 2*A}\n')
-    assert load_layout(str(path)).columns == {'x': '2*A'}
+    path.write_text('length: mm\ncolumns: {x: 2*A, q6: 0}\n')
+    assert load_layout(str(path)).columns == {'x': '2*A', 'q6': '0'}
     for text, error in (
         ('lenght: mm', UnknownNameError),
         ('length: ell', ConfigError),
@@ -82,7 +82,7 @@ def test_presets_of_users_and_their_faults(tmp_path):
 
 
 @pytest.mark.parametrize(
-    'text', ['a**b', 'f(x)', 'a b', '1+', '__import__("os")', '{}', '', 'a;b']
+    'text', ['a**b', 'f(x)', 'a b', '1+', '__import__("os")', '{}', '', 'a;b', 'a;']
 )
 def test_what_is_no_expression(text):
     with pytest.raises(ConfigError, match='not an expression'):

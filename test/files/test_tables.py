@@ -9,6 +9,8 @@ import pytest
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files import loading
 from calib_ros.files.columns import read_columns
+from calib_ros.files.foreign import Foreign
+from calib_ros.files.layouts import Layout
 from calib_ros.files.measurements import distinct_rows
 from calib_ros.files.tables import read_table
 from calib_ros.kinematics.chain import Chain, Joint
@@ -54,6 +56,31 @@ def test_columns_in_any_order_with_byte_order_mark_and_windows_lines(read):
     fitted, _ = read(text)
     np.testing.assert_array_equal(fitted.joints, [[0.1, 0.2]])
     np.testing.assert_array_equal(fitted.positions, [[1, 2, 3]])
+
+
+OF_JOINTS = {f'q{k}': f'q{k}' for k in (1, 2, 3)}
+LEFT_OUT = 'it has no q3 (q3): left out'
+
+
+@pytest.mark.parametrize(
+    ('text', 'layout', 'x', 'said'),
+    [
+        (POINTS, {'columns': OF_JOINTS}, 1.0, LEFT_OUT),
+        (POINTS.replace('z\n', 'z\n// 9,9,9,9,9\n'), {'comment': '//'}, 1.0, 'no units are given'),
+        (f'units: mm\n{POINTS}', {}, 1e-3, 'its lines of units say that lengths are in mm'),
+        (POINTS.replace('x,', 'x [ticks],'), {'columns': {'x': 'x*2'}}, 2.0, 'no units are given'),
+        (f'Cell,of,Anna,on,Monday,in,Hall\n{POINTS}', {'columns': {'x': 'x'}}, 1.0, 'no units'),
+    ],
+    ids=['too many joints', 'commented out', 'units above', 'converted', 'a long title'],
+)
+def test_what_stands_beside_the_numbers_of_others_is_told_or_ignored(
+    tmp_path, text, layout, x, said
+):
+    path = tmp_path / 'cell.csv'
+    path.write_text(text)
+    table = read_table(path, 2, foreign=Foreign(Layout(**layout)))
+    assert table.fitted[0].positions[:, 0].tolist() == [x, 4.5 * x]
+    assert any(said in each for each in table.warnings)
 
 
 def test_a_session_that_is_not_there_lists_those_that_are(read):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from urdfs import PANDA, UR10E, ZERO, Z, arm as serial_arm, by_kinpy, ur10e
+from urdfs import PANDA, UR10E, UR10E_ORIGINS, ZERO, Z, arm as serial_arm, by_kinpy, ur10e
 
 from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.errors import ConfigError
@@ -24,6 +24,11 @@ FRANKAS = ('franka_panda', 'franka_fr3')
 TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
 """From base_link of ur_description to the base of the controller, and of the table."""
 NUMBERS = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
+
+
+ASIDE = ((-0.6127, 0, -0.17), ZERO), ((-0.57155, 0, 0.34415), ZERO)
+UR10E_ASIDE = ur10e([*UR10E_ORIGINS[:2], *ASIDE, *UR10E_ORIGINS[4:]])
+"""With the elbow further along its axis, as older descriptions have it; where no table has it."""
 
 
 def corrected(nominal, seed=0):
@@ -114,7 +119,11 @@ def test_nominal_files_are_those_of_the_vendors():
 
 @pytest.mark.parametrize(
     ('text', 'ends', 'tip'),
-    [(UR10E, ('base_link', 'tool0'), None), (PANDA, ('panda_link0', 'panda_link8'), 'panda_hand')],
+    [
+        (UR10E, ('base_link', 'tool0'), None),
+        (UR10E_ASIDE, ('base_link', 'tool0'), None),
+        (PANDA, ('panda_link0', 'panda_link8'), 'panda_hand'),
+    ],
 )
 def test_frames_are_those_of_the_urdf_if_there_is_one(text, ends, tip, rng):
     nominal = replace(chain_from_urdf(text, tip_link=tip), base=None, tool=None)
@@ -125,7 +134,7 @@ def test_frames_are_those_of_the_urdf_if_there_is_one(text, ends, tip, rng):
     poses = poses_of(found.content, chain.joint_names, q)
     np.testing.assert_allclose(poses, expected, rtol=0, atol=1e-9)
     (unchanged,) = vendor_files(nominal, nominal, urdf=text, links={'tip_link': tip})
-    vendor = vendors.UR if text is UR10E else vendors.FRANKA
+    vendor = vendors.FRANKA if text is PANDA else vendors.UR
     described = {each.name: each.origin for each in parse_urdf(text).joints}
     numbers = published(unchanged.content, vendor)
     for name, row in zip(nominal.joint_names, numbers, strict=False):
