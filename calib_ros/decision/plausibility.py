@@ -230,9 +230,12 @@ def _lag(problem: Problem, result: Identification) -> Identification:
 def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | None] | None:
     """Return that poses lie towards the previous stop, and the problem with that delay.
 
-    Or that the joints have play, without a problem; None if neither explains most.
+    Or that the joints have play, without a problem; None if neither explains most. Sockets and
+    planes do not smooth: moves from one touch to the next only show the noise of both.
     """
-    bases = sorted({each.base for each in problem.sets})
+    bases = sorted({s.base for s in problem.sets if not (s.socket or s.plane)})
+    if not bases:
+        return None
     chain, delays = result.chain, [Parameter(name, DELAY) for name in bases]
     for name in bases:
         chain = chain.with_frame(name, replace(chain.frame(name), delay=0.0))

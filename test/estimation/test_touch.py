@@ -212,6 +212,18 @@ def test_with_positions_touches_tell_the_size_as_well():
     assert all(better)
 
 
+def test_touches_show_no_lag():
+    """Moves within a plane are the noise of both ends: of 8 sessions 4 lay 'towards the last'."""
+    true, sets = cell(3, 2 * SIGMA, 24, 2)
+    rng = np.random.default_rng(3)
+    seen = measure(true, true.random_joints(40, rng), rng, 1e-4, oriented=False)
+    lengths = np.linalg.norm(seen.positions - [1.2, 0.5, 0.3], axis=1)
+    sets.append(replace(seen, distances=lengths, base='base_wire'))
+    result = identify(Problem(UR, sets[0], more=sets[1:], sigma_touch=SIGMA))
+    assert result.noise.position > 1.0
+    assert not result.remarks
+
+
 def test_touches_beside_a_plane_are_named():
     true, sets = cell(3)
     q = sets[0].joints.copy()
