@@ -142,7 +142,7 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
             'new poses': f'{found.after.count}, each judged by the others',
             'position error': words.rms_change((found.before, found.after)),
             '95 % interval': _intervals(found.comparison),
-            'arm known to': applied.known_to(found),
+            'arm known to': applied.known_to(found, '->'),
         }
     )
     for why in state.text:

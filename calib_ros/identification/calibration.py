@@ -302,7 +302,7 @@ class Calibration(Shown):
             return '', ''
         shift, turn = self.sigma(joints), self.sigma(joints, np.s_[3:])
         words = (
-            'uncertainty of these poses (one sigma): at most '
+            'standard deviation of these poses: at most '
             f'{1e3 * shift.max():.3f} mm at the target measured and '
             f'{1e3 * turn.max():.3f} mrad'
         )

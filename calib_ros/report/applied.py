@@ -224,10 +224,10 @@ def update_standing(found: Recalibration) -> tuple[Headline, tuple[str, ...], st
     return Headline('good' if found.accepted else 'bad', heading, text), changed, step
 
 
-def known_to(found: Recalibration) -> str:
+def known_to(found: Recalibration, arrow: str = '→') -> str:
     """Return how well the arm was and is known."""
-    known = f'{1e3 * found.known_before:.3f} -> {1e3 * found.known_after:.3f} mm'
-    return f'{known} over the joint range (one sigma)'
+    known = f'{1e3 * found.known_before:.3f} {arrow} {1e3 * found.known_after:.3f} mm'
+    return f'{known} over the joint range (standard deviation)'
 
 
 def update_report(

@@ -100,7 +100,7 @@ def against_noise(poses: Poses) -> Figure:
         data.append(_curve('markers', name, x, y, marker=marker))
     ends = np.array([-3.0, 3.0])
     data.append(_curve('lines', 'noise as stated', ends, ends, line=DOTTED))
-    across, up = axis('expected from pure noise [sigma]'), axis('measured [stated sigma]')
+    across, up = axis('expected from pure noise'), axis('measured [times the stated noise]')
     return {'data': data, 'layout': {'xaxis': across, 'yaxis': up}}
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 
 from calib_ros.apply.workspace import Placements, Survey, rms_map
 from calib_ros.decision.result import Identification
@@ -186,7 +187,9 @@ def _draw_colours(axes: Axes, mesh: Mapping[str, Any]) -> None:
     drawn = axes.pcolormesh(x, y, values, shading='nearest', cmap=colours, rasterized=True)
     drawn.set_clim(mesh.get('zmin'), mesh.get('zmax'))
     if mesh.get('showscale', True):
-        axes.figure.colorbar(drawn, ax=axes, label=mesh['colorbar']['title']['text'])
+        bar = mesh['colorbar']
+        ticks, label = bar.get('dtick') and MultipleLocator(bar['dtick']), bar['title']['text']
+        axes.figure.colorbar(drawn, ax=axes.figure.axes, label=label, ticks=ticks)
     for name, ticks in (('x', mesh['x']), ('y', mesh['y'])):
         if isinstance(ticks[0], str):
             turned = {'rotation': 90} if name == 'x' else {}
@@ -198,6 +201,7 @@ def _draw_axes(axes: Axes, x: Mapping[str, Any], y: Mapping[str, Any]) -> None:
         axes.set(**{f'{name}label': axis.get('title', {}).get('text', '')})
         if 'range' in axis:
             axes.set(**{f'{name}lim': axis['range']})
+    axes.tick_params(labelleft=y.get('showticklabels', True))
     if y.get('autorange') == 'reversed':
         axes.invert_yaxis()
 

@@ -22,7 +22,7 @@ from calib_ros.shown import rounded
 
 BOTH = (
     'it contains both AP and RP of ISO 9283 (accuracy and repeatability), because each '
-    'measurement counts by itself. Sigma: standard deviation of the errors.'
+    'measurement counts by itself. Std: standard deviation of the errors.'
 )
 ERROR = (
     'Error: distance from the measured target to its place in the model. With this model in the '
@@ -30,7 +30,7 @@ ERROR = (
 )
 OF_THE_PROGRAM = f'Error: distance from the measured target to its place in the program; {BOTH}'
 LABELS = (
-    *('RMS [mm]', '95 % interval [mm]', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
+    *('RMS [mm]', '95 % interval [mm]', 'mean [mm]', 'largest [mm]', 'mean + 3 std [mm]'),
     *('RMS orientation [mrad]', 'RMS [px]'),
 )
 """Rows of the accuracy table below head and count."""
@@ -140,9 +140,9 @@ def outliers(poses: Poses) -> Section:
         'They differ from the others by more than this arm and device explain: little or no '
         'weight in the fit, none in the figures. Measure them again, or find out what happened.'
         f'{more}',
-        head=('from', poses.things[:-1], 'residual [sigma]', 'error after [mm]'),
+        head=('from', 'residual [usual errors]', 'error after [mm]'),
         rows=tuple(
-            (poses.source(k), str(k + 1), size, f'{after[k]:.3f}')
+            (poses.source(k), size, f'{after[k]:.3f}')
             for k in rows[:50].tolist()
             for size in ('held out' if np.isnan(poses.size[k]) else f'{poses.size[k]:.1f}',)
         ),

@@ -114,7 +114,7 @@ def each_in_words(found: Verification) -> list[str]:
     """Return the table lines of the poses [mm]; of ISO 9283 only if the program is known."""
     repeated = any(pose.repeatability is not None for pose in found.each)
     what = 'repeatability' if found.by_program else 'scatter'
-    lines = ['  pose   measured   before    after' + repeated * f'   {what} (mean + 3 sigma)']
+    lines = ['  pose   measured   before    after' + repeated * f'   {what} (mean + 3 std)']
     for k, pose in enumerate(found.each, 1):
         line = f'  {k:4} {pose.cycles:10} {rounded(pose.before):>8} {rounded(pose.after):>8}'
         again = '' if pose.repeatability is None else f' {rounded(pose.repeatability):>8}'
@@ -154,7 +154,7 @@ def hints(found: Verification) -> list[str]:
     if found.verdict == 'UNDECIDED' and not found.outside:
         enough, side = f'not even {DECIDING:,}', 'decide'
         if found.needed and found.limit:
-            side = f'be {"within" if found.rms <= found.limit else "beyond"} the limit'
+            side = f'be {"within" if found.rms <= found.limit else "beyond"} {_wanted(found)}'
             enough = f'about {found.needed:,}'
         lines.append(f'{enough} poses with the same RMS error would {side}, these included')
     before, rms = (each.rms_mm for each in found.comparison.figures)
@@ -205,6 +205,10 @@ def causes(found: Verification) -> list[str]:
     return lines
 
 
+def _wanted(found: Verification) -> str:
+    return 'the limit' if found.tolerance is None else 'the tolerance'
+
+
 def _odd_in_words(found: Verification) -> str:
     """Return which poses are beyond the limit while the others are within it."""
     first, last = found.odd[0] + 1, found.odd[-1] + 1
@@ -215,9 +219,9 @@ def _odd_in_words(found: Verification) -> str:
         names = f'poses {first} to {last} alone are up to'
     far = 1e3 * norms(found.comparison.after.position[np.isin(found.group, found.odd)]).max()
     return (
-        f'{names} {rounded(far)} mm off; the others are within the limit: measure again; if the '
-        'error stays, find out what moved, changed or was hit; an arm may also be worse in part '
-        'of its range'
+        f'{names} {rounded(far)} mm off; the others are within {_wanted(found)}: measure again; '
+        'if the error stays, find out what moved, changed or was hit; an arm may also be worse in '
+        'part of its range'
     )
 
 
@@ -273,14 +277,14 @@ def _by_configuration(found: Verification) -> Section:
     """Return the figures of the standard, or of errors at the joint values that were reported."""
     title, names = 'Pose by pose (ISO 9283) [mm]', ('AP before', 'AP after', 'RP')
     text = (
-        'AP: position accuracy of the mean over all cycles. RP: repeatability, mean + 3 sigma. '
+        'AP: position accuracy of the mean over all cycles. RP: repeatability, mean + 3 std. '
         'The standard asks for 30 cycles.'
     )
     if not found.by_program:
         title, names = 'Pose by pose', ('before [mm]', 'after [mm]', 'scatter [mm]')
         text = (
             'Errors at the joint values reported: of the mean over all cycles, and their scatter, '
-            'mean + 3 sigma. AP and RP of ISO 9283 need the program (--commanded).'
+            'mean + 3 std. AP and RP of ISO 9283 need the program (--commanded).'
         )
     shown = 2 + any(each.repeatability is not None for each in found.each)
     return section(

@@ -262,7 +262,7 @@ def unmodelled_in_words(result: Identification) -> str:
     come = 'may come' if result.noise.consistent else 'seems to come'
     text = (
         f'Part of the remaining error {come} from the arm and is not in the model, as if joints '
-        f'were off by {off} (one sigma). Expected errors include it.'
+        f'were off by {off} (standard deviation). Expected errors include it.'
     )
     return text if off and not result.surprise else ''
 

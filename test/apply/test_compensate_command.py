@@ -91,7 +91,7 @@ def test_the_whole_way_from_identification_to_program(run, tmp_path, oriented):
     q = regular(UR, 30, seed=2)
     status, said, err = run(joints_csv(q), '--calibration', 'result')
     assert status == 0
-    assert 'uncertainty of these poses (one sigma): at most 0.' in said
+    assert 'standard deviation of these poses: at most 0.' in said
     assert ('does not know the orientation' in err) is not oriented
     joints = np.loadtxt('out.csv', delimiter=',', skiprows=1)
     frames = {'base': found.chain.base, 'tool': found.chain.tool}

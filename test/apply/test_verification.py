@@ -200,7 +200,7 @@ def test_the_repeatability_of_the_standard_needs_the_program(cell, arm, program)
         assert pose.repeatability == pytest.approx(1e3 * (apart.mean() + 3.0 * apart.std(ddof=1)))
         assert other.repeatability < 0.3 * pose.repeatability
     for each, word in ((found, 'repeatability'), (alone, 'scatter')):
-        assert f'after   {word} (mean + 3 sigma)' in in_words(each)
+        assert f'after   {word} (mean + 3 std)' in in_words(each)
         assert ('AP after' in _by_configuration(each).head) is each.by_program
         page = verification_page(arm.chain, [seen], each)
         assert ('its place in the program' in str(page.accuracy)) is each.by_program

@@ -174,7 +174,7 @@ def test_measurements_that_were_fitted_prove_nothing(cell, arm, folder, run):
         for text in (out, *(file.read_text() for file in files)):
             assert ('calibration was fitted to' in ' '.join(text.split())) is warned
             assert ('PASS: the calibration' in text) is not warned
-        assert '| mean + 3 sigma' in files[1].read_text()
+        assert '| mean + 3 std' in files[1].read_text()
 
 
 def test_the_serial_number_comes_with_the_calibration(cell, folder, run):

@@ -179,10 +179,10 @@ def test_a_row_picks_the_pose_and_a_point_its_row(wide, result):
     page = wide.page
     page.click('#next')
     button = page.locator('#rows tbody button').first
-    assert button.inner_text() == '13'
+    assert button.inner_text() == 'line 14'
     button.focus()
     button.press('Enter')
-    assert page.inner_text('#rows tr.picked button') == '13'
+    assert page.inner_text('#rows tr.picked button') == 'line 14'
     tip, there = page.evaluate(
         '(() => { const c = window.calibRos; const T = c.frames(12).at(-1);'
         ' return [[T[0][3], T[1][3], T[2][3]], c.position(12)]; })()'
@@ -196,7 +196,7 @@ def test_a_row_picks_the_pose_and_a_point_its_row(wide, result):
         "document.getElementById('space').emit('plotly_click',"
         ' {points: [{customdata: 3, curveNumber: 1}]})'
     )
-    assert page.inner_text('#rows tr.picked button') == '4'
+    assert page.inner_text('#rows tr.picked button') == 'line 5'
     assert 'line 5' in page.inner_text('#picked')
     assert 'an outlier' in page.inner_text('#picked')
 
@@ -234,8 +234,8 @@ def test_the_arrows_turn_the_view(wide, way):
 def test_the_list_shows_the_largest_errors_first_and_outliers_alone(wide):
     page = wide.page
     page.select_option('#sort', 'after')
-    assert page.inner_text('#rows tbody tr:first-child button') == '4'
-    shown = [float(cell) for cell in page.locator('#rows tbody td:nth-child(4)').all_inner_texts()]
+    assert page.inner_text('#rows tbody tr:first-child button') == 'line 5'
+    shown = [float(cell) for cell in page.locator('#rows tbody td:nth-child(3)').all_inner_texts()]
     assert shown == sorted(shown, reverse=True)
     page.check('#only')
     assert page.locator('#rows tbody tr').count() == 1
@@ -354,7 +354,7 @@ def test_a_printed_plan_is_no_certificate(chromium, tmp_path):
 
 def test_columns_and_maps_are_within_a_telephone(chromium, result):
     seen = Seen(chromium, result / 'report.html', 400)
-    used = "document.querySelectorAll('#rows th')[4]"
+    used = "document.querySelectorAll('#rows th')[3]"
     assert seen.page.evaluate(f'{used}.textContent') == 'used'
     assert seen.page.evaluate(f'{used}.getBoundingClientRect().right') < 400
     seen.drawn()
@@ -388,7 +388,7 @@ def test_many_refused_poses_on_a_telephone(chromium, tmp_path, monkeypatch):
     assert 0 < len(cells) <= 40
     bands = page.evaluate("document.getElementById('session').data.map((t) => t.fill)")
     assert bands.count('tonexty') == 2
-    shown = page.inner_text('#rows tbody tr:first-child td:nth-child(2)')
+    shown = page.inner_text('#rows tbody tr:first-child td:nth-child(1)')
     assert shown in map(moment, stamps.tolist())
     page.locator('#rows tbody button').last.click()
     assert 'Picked' in page.inner_text('#picked')

@@ -360,9 +360,9 @@ def test_outliers_held_out_are_listed_too(unsearched):
         report = report_of(problem, identify(problem))
         (table,) = (each for each in report.sections if each.name == 'outliers')
         assert table.title == f'Outliers: {1 + fitted} of {TRAIN + TEST} poses'
-        assert [row[2] for row in table.rows][fitted:] == ['held out']
-        assert table.head[2] == 'residual [sigma]'  # no ratio to that of a usual pose, 1.5 to 2
-        assert [float(row[3]) > 10.0 for row in table.rows] == [True] * (1 + fitted)
+        assert [row[1] for row in table.rows][fitted:] == ['held out']
+        assert table.head[1] == 'residual [usual errors]'  # along one axis: a usual pose has 1.5
+        assert [float(row[2]) > 10.0 for row in table.rows] == [True] * (1 + fitted)
 
 
 def test_poses_and_measurements_are_two_counts(solved):

@@ -203,7 +203,7 @@ def test_a_trajectory_is_corrected(calibrated, monkeypatch):
     message = trajectory(q, velocities, accelerations, times)
     said = send(calibrated, message)
     assert said.startswith('50 of 50 points corrected')
-    assert 'uncertainty of these poses (one sigma): at most 0.0' in said
+    assert 'standard deviation of these poses: at most 0.0' in said
     assert 'does not know the orientation' not in said
     calibrated.spin_until(lambda: corrected)
     (answer,) = corrected

@@ -62,7 +62,6 @@
   const unpacked = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
   for (const [name, text] of Object.entries(e.arrays)) floats[name] = new Float32Array(unpacked(text));
   const stamps = new BigInt64Array(unpacked(e.stamps)), count = stamps.length;
-  const number = (i) => (e.number ? e.number[i] : i + 1);
   const source = (i) => {
     if (e.images[i]) return e.images[i];
     if (e.lines) return 'line ' + stamps[i] / 1000000000n;
@@ -203,15 +202,14 @@
   const SIZE = 12;
   const sized = floats.size.some(Number.isFinite), roles = new Set(e.role).size > 1 || outliers.length > 0;
   const columns = [
-    ['from', source],
     ['before [mm]', (i) => fixed(lengths.before[i])], ['after [mm]', (i) => fixed(lengths.after[i])],
     roles && ['used', (i) => e.roles[e.role[i]] + (e.outlier[i] ? ', outlier' : '')],
     e.oriented && ['before [mrad]', (i) => fixed(floats.turned_before[i])],
     e.oriented && ['after [mrad]', (i) => fixed(floats.turned_after[i])],
-    sized && ['residual [sigma]', (i) => fixed(floats.size[i], 1)],
+    sized && ['residual [usual errors]', (i) => fixed(floats.size[i], 1)],
     ...e.joints.map((name, k) => [`${name} [${e.show[k][1]}]`, (i) => fixed(floats.joints[n * i + k] * e.show[k][0], e.show[k][2])]),
   ].filter(Boolean);
-  const isNumber = ([title]) => !['from', 'used'].includes(title);
+  const isNumber = ([title]) => title !== 'used';
   function cell(row, text, number = true) {
     const td = row.insertCell();
     td.textContent = text;
@@ -233,8 +231,8 @@
       row.className = i === state.picked ? 'picked' : e.outlier[i] ? 'outlier' : '';
       const button = document.createElement('button');
       button.type = 'button';
-      button.textContent = number(i);
-      button.setAttribute('aria-label', `Show ${e.things.slice(0, -1)} ${number(i)} in the figure`);
+      button.textContent = source(i);
+      button.setAttribute('aria-label', `Show ${e.things.slice(0, -1)} ${source(i)} in the figure`);
       button.addEventListener('click', () => { pick(i, true); byId('rows').querySelector('.picked button').focus(); });
       cell(row, '', false).append(button);
       for (const each of columns) cell(row, each[1](i), isNumber(each));
