@@ -7,12 +7,13 @@ from typing import get_args
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings, strategies as st
-from recorded import distance, point_stamped, pose_with_covariance
+from recorded import distance, point_stamped, pose_stamped, pose_with_covariance, serialised
 from streams import (
     MS,
     POSE,
     RANGE,
     START,
+    TRACKER,
     TRANSFORM,
     joint_state,
     of_joints,
@@ -25,7 +26,10 @@ from streams import (
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.sampling.account import Cause, lost
+from calib_ros.sampling.batches import Stream, decode
+from calib_ros.sampling.message_filter import FrameNames, JointNames, MessageFilter
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.slices import POSES, Part
 from calib_ros.sampling.sources import Source
 from calib_ros.settings import Mode, Settings
 
@@ -192,3 +196,20 @@ def test_a_driver_that_publishes_each_pose_twice_loses_nothing(full):
     for sample in session.samples:
         assert sample.rotation is not None
         assert (sample.covariance is not None) == full
+
+
+def test_a_covariance_of_zeros_is_none_and_what_is_not_recorded_is_counted():
+    numbers = np.zeros((2, 43))
+    numbers[:, 6], numbers[1, 7::7] = 1.0, 1e-8
+    part = Part(np.arange(2), TRACKER, ('world', 'ball'), np.array([1, 2]), numbers)
+    admitted = MessageFilter(JointNames(['a']), FrameNames(), 1)
+    (piece,) = admitted.pieces([part._replace(numbers=numbers.copy())], recording=True)
+    assert np.isnan(piece.numbers[:, 7:]).all(axis=1).tolist() == [True, False]
+    assert admitted.pieces([part], recording=False) == []
+    assert admitted.unused == {Cause(POSES, 'not recording'): 2}
+
+
+def test_a_frame_is_the_same_with_a_slash_before_its_name():
+    come = [serialised(pose_stamped(1, frame=name)) for name in ('/world', 'world')]
+    parts, _ = decode([(Stream('pose', POSE, TRACKER), each) for each in come], None)
+    assert {part.strings[0] for part in parts} == {'world'}
