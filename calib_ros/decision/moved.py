@@ -5,13 +5,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.shown import are_lines, moment, rows_in_words
 
-FRAMES = ('base', 'tool')
+ZERO = 'zero'  # of the distances of a device
+FRAMES = ('base', 'tool', ZERO)
 FROM_THERE = 'from there on'
 OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
 
@@ -20,14 +23,14 @@ OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joi
 class Step:
     """What moved, when and by how much.
 
-    A base or tool frame, a joint, all joints or the load (`kind`: 'base', 'tool', 'joint',
-    'joints' or 'load'); `thing` names the device or target there. `set`, `sample` and `stamp_ns`
-    belong to the first sample after the step, which a reader finds at `where`. `size` is the RMS
-    change of positions ('m') or, if that weighs more, orientations ('rad'); of a joint that of its
-    zero. `share` is its share of the squared residuals beyond that of as many useless parameters.
-    If all measurements on one side are outliers, `unused` says which: the fit of frames is not
-    affected. If the arm's places before and after lie `apart`, its errors may look like a step of
-    that size.
+    A base or tool frame, the zero of distances, a joint, all joints or the load (`kind`: 'base',
+    'tool', 'zero', 'joint', 'joints' or 'load'); `thing` names the device or target there. `set`,
+    `sample` and `stamp_ns` belong to the first sample after the step, which a reader finds at
+    `where`. `size` is the RMS change of positions ('m') or, if that weighs more, orientations
+    ('rad'); of a zero its own. `share` is its share of the squared residuals beyond that of as
+    many useless parameters. If all measurements on one side are outliers, `unused` says which: the
+    fit of frames is not affected. If the arm's places before and after lie `apart`, its errors may
+    look like a step of that size.
     """
 
     what: str
@@ -83,7 +86,7 @@ class Step:
             off = f'the {self.what} held by the chain file is off {size}'
             return Reason(Rule.MISTAKE, f'{off}: correct it, or remove fixed: true there')
         thing, of = self.thing, f' ({self.what})'
-        if self.kind == 'joint':
+        if self.kind in ('joint', ZERO):
             thing, of = f'the zero of {self.what}', ''
         text, more = f'{thing} moved {size}{of} before {self.where}', ''
         if self.slow:
@@ -132,3 +135,47 @@ def thing_of(kind: str, seen: Observations) -> str:
     on_flange, other = (device, target) if seen.inverse or seen.on_flange else (target, device)
     *first, last = on_flange if kind == 'tool' else [*other, "the robot's foot"]
     return f'{", ".join(first)} or {last}' if first else last
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """Columns switched on together: a frame of some sets, zeros of joints, or the load."""
+
+    what: str
+    kind: str
+    names: tuple[str, ...]
+    sets: tuple[int, ...]
+    held: bool = False
+
+
+def of_the_arm(problem: Problem) -> list[Moving]:
+    """Return the load, with the torque of a weight at the last joint, and the zeros of all."""
+    joints, everywhere = problem.chain.joints, tuple(range(len(problem.sets)))
+    last = joints[-1].name
+    load = tuple(Parameter(j.name, f'gravity_{last}') for j in joints if j.type == 'revolute')
+    zeros = tuple(joint.driven for joint in joints)
+    loads = [Moving('the load', 'load', load, everywhere)] if load else []
+    return [*loads, Moving('all joints', 'joints', zeros, everywhere)]
+
+
+def groups_of(problem: Problem) -> list[Moving]:
+    """Return what may move: frames, zeros of joints, then of distances, one and all together."""
+    found = []
+    for kind in ('base', 'tool'):
+        for frame in dict.fromkeys(getattr(each, kind) for each in problem.sets):
+            sets = [k for k, each in enumerate(problem.sets) if getattr(each, kind) == frame]
+            seen = problem.sets[sets[0]]
+            socket = kind == 'base' and (seen.socket or seen.seen)  # the ball turns in it
+            names = parameters_of(frame)[: 3 if socket else 6]
+            found.append(Moving(frame, kind, names, tuple(sets), problem.model.frame(frame).fixed))
+    joints, everywhere = problem.chain.joints, tuple(range(len(problem.sets)))
+    found += [Moving(each.name, 'joint', (each.driven,), everywhere) for each in joints]
+    wires: dict[str, list[int]] = {}
+    for k, each in enumerate(problem.sets):
+        if each.distances is not None and not each.plane:
+            wires.setdefault(each.base, []).append(k)
+    found += [Moving(w, ZERO, (Parameter(w, ZERO),), tuple(sets)) for w, sets in wires.items()]
+    if len(wires) > 1:
+        names, sets = tuple(Parameter(w, ZERO) for w in wires), sorted(chain(*wires.values()))
+        found.append(Moving(', '.join(wires), ZERO, names, tuple(sets)))
+    return found

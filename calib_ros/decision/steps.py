@@ -23,20 +23,30 @@ import numpy as np
 
 from calib_ros.decision.drift import slow_cosines
 from calib_ros.decision.imitations import LEAST, Imitation
-from calib_ros.decision.moved import FRAMES, FROM_THERE, Step, place_of, thing_of
+from calib_ros.decision.moved import (
+    FRAMES,
+    FROM_THERE,
+    ZERO,
+    Moving,
+    Step,
+    groups_of,
+    of_the_arm,
+    place_of,
+    thing_of,
+)
 from calib_ros.decision.trials import largest_of
 from calib_ros.estimation.configurations import stops
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import SOME
 from calib_ros.estimation.gain import gain_of, inverse_root
-from calib_ros.estimation.leastsquares import STEP_TOLERANCE
+from calib_ros.estimation.leastsquares import STEP_TOLERANCE, System
 from calib_ros.estimation.levels import LEAST_ASIDE, SURE, chance_of
 from calib_ros.estimation.pixels import in_view
-from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import SUSPICIOUS, weights_of
 from calib_ros.estimation.samples import gram
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.settings import EXCEPTION
 
@@ -100,17 +110,6 @@ def _some_places(stops: int) -> Index:
 
 
 @dataclass(frozen=True, eq=False)
-class _Group:
-    """Columns switched on together: a frame of some sets, zeros of joints, or the load."""
-
-    what: str
-    kind: str
-    names: tuple[str, ...]
-    sets: tuple[int, ...]
-    held: bool = False
-
-
-@dataclass(frozen=True, eq=False)
 class _Found:
     """A step: its group, its first stop, and its size by parameter.
 
@@ -118,7 +117,7 @@ class _Found:
     move that the arm imitates they are 1 and 0.
     """
 
-    group: _Group
+    group: Moving
     stop: int
     size: FloatArray
     share: float
@@ -132,7 +131,7 @@ class _Scan:
     def __init__(self, fitted: Fitted, loaded: bool, gross: bool) -> None:
         problem, names, robust = fitted.problem, fitted.names, fitted.robust
         self._problem, self._chain, self.gross = problem, robust.fit.chain, gross
-        self._groups = _groups(problem) + (_of_the_arm(problem) if loaded else [])
+        self._groups = groups_of(problem) + (of_the_arm(problem) if loaded else [])
         constant = [n for g in self._groups if g.kind == 'load' for n in g.names if n not in names]
         self._chain = self._chain.with_effects(constant)
         zeros = [joint.driven for joint in problem.chain.joints]
@@ -151,7 +150,7 @@ class _Scan:
         weights = (weights_of(each, bounded) for each in far)
         few = few.weighted([w * each for w, each in zip(weights, seen, strict=True)])
         self._equations = np.array([float(samples.rows) for samples in few.sets])
-        self._rows = few.rows_of(self._chain, self._names)
+        self._rows = _rows_of(few, self._chain, self._names)
         self._sets = sets = [samples.observations for samples in few.sets]
         order = np.argsort(np.concatenate([each.stamps_ns for each in sets]), kind='stable')
         number = np.empty(len(order), dtype=np.intp)
@@ -178,7 +177,7 @@ class _Scan:
         usual = bool(self._left.sum() < SUSPICIOUS**2 * self._equations.sum())
         self.explained = bool(constant) and usual and fitted.noise.position >= SUSPICIOUS
 
-    def _budget(self, group: _Group) -> tuple[float, float, float]:
+    def _budget(self, group: Moving) -> tuple[float, float, float]:
         """Return equations, degrees of freedom and remaining squares of a group's sets."""
         sets = list(group.sets)
         equations = float(self._equations[sets].sum())
@@ -274,7 +273,7 @@ class _Scan:
         alone = len(gross) >= LEAST_ASIDE and np.ptp(gross) < len(gross)
         return (int(gross[0]), int(gross[-1]) + 1) if alone else ()
 
-    def _moving(self, group: _Group, products: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _moving(self, group: Moving, products: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return products (B, K, P + 1) of a group's moves with the fit, and (B, K, K)."""
         own = products[:, [self._added.index(name) for name in group.names]]
         columns = [self._names.index(name) for name in group.names]
@@ -331,15 +330,17 @@ class _Scan:
             for number, each, late in zip(group.sets, sets, after, strict=True)
             for stamp, k in zip(each.stamps_ns[late], self._chosen[number][late], strict=True)
         )
+        known = [Parameter(name).kind != ZERO for name in group.names]
+        names = [name for name, of_arm in zip(group.names, known, strict=True) if of_arm]
         moved = [
-            ErrorModel(self._chain, group.names, each.base, each.tool).jacobian(each.joints[late])
+            ErrorModel(self._chain, names, each.base, each.tool).jacobian(each.joints[late])
             for each, late in zip(sets, after, strict=True)
         ]
-        change = np.sqrt(((np.concatenate(moved) @ found.size) ** 2).mean(axis=0))
+        change = np.sqrt(((np.concatenate(moved) @ found.size[known]) ** 2).mean(axis=0))
         size, turn = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
         unit, oriented = 'm', any(each.turned for each in problem.sets)
-        if group.kind == 'joint':
-            size, unit = abs(float(found.size[0])), Parameter(group.names[0]).unit
+        if group.kind in ('joint', ZERO):
+            size, unit = float(np.abs(found.size).max()), Parameter(group.names[0]).unit
         elif oriented and turn * problem.sigma_position > size * problem.sigma_orientation:
             size, unit = turn, 'rad'
         weights = np.concatenate([self._weights[k] for k in group.sets])
@@ -375,24 +376,14 @@ def _separable(joints: FloatArray, after: Flags) -> bool:
     return bool(left @ left * (len(joints) - 1) < EXCEPTION * freedom * (side @ side))
 
 
-def _of_the_arm(problem: Problem) -> list[_Group]:
-    """Return the load, with the torque of a weight at the last joint, and the zeros of all."""
-    joints, everywhere = problem.chain.joints, tuple(range(len(problem.sets)))
-    last = joints[-1].name
-    load = tuple(Parameter(j.name, f'gravity_{last}') for j in joints if j.type == 'revolute')
-    zeros = tuple(joint.driven for joint in joints)
-    loads = [_Group('the load', 'load', load, everywhere)] if load else []
-    return [*loads, _Group('all joints', 'joints', zeros, everywhere)]
-
-
-def _groups(problem: Problem) -> list[_Group]:
-    found = []
-    for kind in ('base', 'tool'):
-        for frame in dict.fromkeys(getattr(each, kind) for each in problem.sets):
-            sets = [k for k, each in enumerate(problem.sets) if getattr(each, kind) == frame]
-            seen = problem.sets[sets[0]]
-            socket = kind == 'base' and (seen.socket or seen.seen)  # the ball turns in it
-            names = parameters_of(frame)[: 3 if socket else 6]
-            found.append(_Group(frame, kind, names, tuple(sets), problem.model.frame(frame).fixed))
-    joints, everywhere = problem.chain.joints, tuple(range(len(problem.sets)))
-    return found + [_Group(each.name, 'joint', (each.driven,), everywhere) for each in joints]
+def _rows_of(system: System, chain: Chain, names: Sequence[str]) -> list[FloatArray]:
+    """Return the rows of a system as it does, also by zeros of distances, after all others."""
+    zeros = [name for name in names if Parameter(name).kind == ZERO]
+    rows = system.rows_of(chain, names[: len(names) - len(zeros)])
+    for k, samples in enumerate(system.sets if zeros else ()):
+        seen, own = samples.observations, np.zeros((len(zeros), *rows[k].shape[1:]))
+        if seen.distances is not None and not seen.plane:
+            weights = np.ones(len(seen)) if samples.weights is None else samples.weights
+            own[zeros.index(Parameter(seen.base, ZERO))] = weights / samples.sigmas[0]
+        rows[k] = np.concatenate([rows[k][:-1], own, rows[k][-1:]])
+    return rows

@@ -96,7 +96,7 @@ def _identified(
     uncertainty = replace(uncertainty, parts=wider**2 * uncertainty.parts)
     parameters = parameter_rows(fitted, uncertainty)
     region, scaled = _region(inference, posterior, wider)
-    step = find_step(fitted)
+    step = None if (wrong := zero_of_distances(fitted)) else find_step(fitted)
     result = Identification(
         chain=chain,
         before=before.chain,
@@ -115,7 +115,7 @@ def _identified(
         world_frame=problem.world_frame,
         converged=before.converged and robust.fit.converged and robust.settled,
         chance=_chance(fitted, before.chain),
-        refusals=zero_of_distances(fitted),
+        refusals=wrong,
         posterior=posterior.widened(wider),
         region=region,
         weak=_weak(problem, parameters),

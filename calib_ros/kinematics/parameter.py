@@ -21,7 +21,7 @@ LENS_KINDS = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2', 'k3')
 IN_PIXELS = LENS_KINDS[:4]
 
 _UNITS = {
-    **dict.fromkeys(('a', 'd', 'b', 'x', 'y', 'z', 'play'), 'm'),
+    **dict.fromkeys(('a', 'd', 'b', 'x', 'y', 'z', 'play', 'zero'), 'm'),
     DELAY: 's',
     **dict.fromkeys(LENS_KINDS, '1'),
     **dict.fromkeys(IN_PIXELS, 'px'),

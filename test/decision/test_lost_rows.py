@@ -253,9 +253,10 @@ def test_the_zeros_of_several_draw_wires_are_named_together():
     for seen, anchor, zero in ((first, 0.0, 0.005), (second, 0.7, -0.008)):
         lengths = np.linalg.norm(seen.positions - anchor, axis=1) + zero
         wires.append(replace(seen, distances=lengths, base=f'base_{anchor:.0f}'))
-    (reason,) = zero_of_distances(fit(Problem(UR10E, wires[0], more=wires[1:])))
-    found = re.findall(r'base_\d (\S+) mm', reason)
+    result = identify(Problem(UR10E, wires[0], more=wires[1:]))
+    found = re.findall(r'base_\d (\S+) mm', result.refusals[0])
     np.testing.assert_allclose([float(each) for each in found], [5.0, -8.0], atol=0.5)
+    assert result.step is None
 
 
 def test_a_base_that_is_held_off_is_not_the_zero_of_a_draw_wire():

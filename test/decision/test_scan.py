@@ -181,6 +181,26 @@ def test_a_slip_that_one_of_several_sets_imitates_alone_is_that_of_the_joint(see
     assert step.size == pytest.approx(2e-3, rel=0.1)
 
 
+@pytest.mark.parametrize('jumping', [(0, 1, 2), (1,)])
+def test_zeros_of_draw_wires_that_jump_are_named_one_or_all(jumping):
+    """Anchors of one or two were named, by other sizes, or nothing: 8 of 30 were accepted."""
+    rng = np.random.default_rng(3)
+    true, q = arm(rng), UR10E.random_joints(COUNT, rng)
+    places = measure(true, q, rng, NOISE[0], oriented=False).positions
+    sets = []
+    for k, anchor in enumerate(rng.uniform(-2.0, 2.0, (3, 3))):
+        far = np.linalg.norm(places - anchor, axis=1)
+        far[AT:] += 1e-3 * (k in jumping)
+        one = Observations.from_arrays(q, np.zeros((COUNT, 3)))
+        sets.append(replace(one, base=f'base_{k}', distances=far))
+    chain = replace(UR10E, base=None)
+    step = find_step(fitting.fit(Problem(chain, sets[0], more=sets[1:], **SIGMAS)))
+    assert (step.kind, step.sample, step.slow) == ('zero', AT, False)
+    assert step.what == ', '.join(f'base_{k}' for k in jumping)
+    assert step.size == pytest.approx(1e-3, rel=0.1)
+    assert str(step).startswith(f'the zero of {step.what} moved by')
+
+
 def test_another_load_from_the_first_pose_on_is_no_step_of_an_arm_that_is_held():
     """Measured in one place, then in another, where the weight bends it more."""
     load = {f'{joint}.gravity_wrist_3_joint': 1e-3 for joint in UR10E.joint_names[1:4]}
