@@ -224,11 +224,14 @@ def _check(arm: Calibration, sets: Sequence[Observations], fitted: tuple[str, ..
     chain = arm.chain
     if not sets:
         raise ConfigError('sets must hold at least one set of Observations')
+    if any(each.distances is not None or each.socket for each in sets):
+        raise InputError(
+            'verification needs measured poses or positions: leave out rows of distances, planes '
+            'and sockets'
+        )
     arm.require_frames(sets)
     for each in sets:
         chain.joint_values(each.joints)
-        if each.distances is not None or each.socket:
-            raise InputError('verification needs measured poses or positions, not distances')
         if fitted and each.pixels is not None:
             raise InputError(
                 'images cannot locate a new base or tool: leave both as they were for the '

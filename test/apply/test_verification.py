@@ -393,8 +393,8 @@ def test_what_cannot_be_verified_is_refused(cell, arm):
         verify(arm, [seen], 1e-3, new_base=True)
     with pytest.raises(InputError, match='not base_other: name devices'):
         verify(arm, [replace(seen, base='base_other')], 1e-3)
-    with pytest.raises(InputError, match='not distances'):
-        verify(arm, [replace(seen, distances=np.ones(len(seen)))], 1e-3)
+    with pytest.raises(InputError, match='leave out rows of distances, planes and sockets'):
+        verify(arm, [seen, replace(seen, socket=True, base='base_elsewhere')], 1e-3)
     images = replace(seen, pixels=np.zeros((len(seen), 2)), points=np.zeros((len(seen), 3)))
     with pytest.raises(InputError, match='images cannot locate a new'):
         verify(arm, [images], 1e-3, new_base=True)
