@@ -95,6 +95,7 @@ def _numbers(
     if value is None and not required:
         return []
     if not isinstance(value, list):
-        raise ConfigError(f'{path}: {keys[0]} must be numbers, as camera_calibration writes it')
+        form = '[fx, 0, cx, 0, fy, cy, 0, 0, 1]' if 'k' in keys else '[k1, k2, p1, p2, k3]'
+        raise ConfigError(f'{path}: {keys[0]} must be numbers: {form}')
     rows = [row if isinstance(row, list) else [row] for row in value]
     return [parse_number(each, f'{path}: {keys[0]}') for row in rows for each in row]
