@@ -21,7 +21,14 @@ from calib_ros.decision.result import Identification
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.identifiability import DEGENERATE
-from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, CONFIDENT, MOST_OUTLIERS
+from calib_ros.estimation.levels import (
+    ALIKE,
+    CERTAIN,
+    CLEARLY,
+    CONFIDENT,
+    LARGEST_SCALE,
+    MOST_OUTLIERS,
+)
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags
 from calib_ros.settings import EXCEPTION
@@ -192,9 +199,12 @@ def out_of_scale(scale: float, printed: bool = False, checked: bool = False) -> 
     cause, check = 'the measuring device were out of scale', 'If a known length shows that its'
     if printed:
         cause, check = f'the board were stated too {size}', 'Measure the print; if its'
+    text += f'as if {cause}; then'
+    if printed and abs(scale) < LARGEST_SCALE:  # as arms are
+        text = 'the size of the board is not known well enough:'
     return (
-        f'{text}as if {cause}; then the correction may make the arm worse. {check} scale is '
-        'right, set sigma_scale (--sigma-scale) to its accuracy'
+        f'{text} the correction may make the arm worse. {check} scale is right, set sigma_scale '
+        '(--sigma-scale) to its accuracy'
     )
 
 

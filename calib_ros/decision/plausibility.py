@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -236,22 +237,27 @@ def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | 
     bases = sorted({s.base for s in problem.sets if not (s.socket or s.plane)})
     if not bases:
         return None
-    chain, delays = result.chain, [Parameter(name, DELAY) for name in bases]
+    chain, names, delays = result.chain, result.names, [Parameter(name, DELAY) for name in bases]
+    lens = [name for name in names if Parameter(name).of_lens]
+    if lens and not result.converged:  # it diverges first
+        with suppress(InputError, np.linalg.LinAlgError):
+            given = fit(replace(problem, fixed=(*problem.fixed, *lens)))
+            chain, names = given.chain, given.names
     for name in bases:
         chain = chain.with_frame(name, replace(chain.frame(name), delay=0.0))
     sets = [*map(_with_moves, problem.sets)]
     few = [each.spread() for each in sets]
     shares = [
-        explained_share(problem.with_sets(some), chain, result.names, delays)
-        for some in (few, [_straight(result.chain, each) for each in few])
+        explained_share(problem.with_sets(some), chain, names, delays)
+        for some in (few, [_straight(chain, each) for each in few])
     ]
     if (share := max(shares)) < EXPLAINED:
         return None
     if share > shares[0]:
-        sets = [_straight(result.chain, each) for each in sets]
+        sets = [_straight(chain, each) for each in sets]
     late = problem.with_sets(sets)
-    play = [name for name in effects.members(chain, 'backlash') if name not in result.names]
-    played = explained_share(late, chain.with_effects(play), result.names, play)
+    play = [name for name in effects.members(chain, 'backlash') if name not in names]
+    played = explained_share(late, chain.with_effects(play), names, play)
     if played > share:
         return (
             f'the joints have play, which explains {100.0 * played:.0f} % of the residuals: '
