@@ -59,10 +59,7 @@ def of_them(count: int, what: str) -> str:
 def rows_in_words(
     rows: Sequence[int], stamps_ns: NDArray[np.int64], of_messages: bool = False
 ) -> str:
-    """Return some of N measurements (N,), from 0, as text.
-
-    That is line 2 of a table, poses 3 to 5, 8 of arrays, and the pose of a time of messages.
-    """
+    """Return some of N measurements (N,), from 0: line 2, poses 3 to 5, 8, or their times."""
     lines = are_lines(stamps_ns, of_messages)
     numbers = np.take(stamps_ns // 10**9, rows) if lines else np.add(rows, 1)
     names = [moment(stamps_ns[k]) for k in rows] if of_messages else [*map(str, numbers)]

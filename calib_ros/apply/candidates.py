@@ -19,9 +19,8 @@ from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 def refuse_empty(what: str, corners: FloatArray) -> None:
     """Refuse corners (2, 3) whose lower one does not come first."""
     if not (corners[0] <= corners[1]).all():
-        lower, upper = corners.tolist()
-        empty = f'the {what} from {lower} to {upper} is empty'
-        raise ConfigError(f'{empty}: give the lower corner first')
+        given = ' to '.join(map(str, corners.tolist()))
+        raise ConfigError(f'the {what} from {given} is empty: give the lower corner first')
 
 
 @dataclass(frozen=True, eq=False)

@@ -172,8 +172,8 @@ def still_holds(updated: Recalibration, found: Judgement) -> tuple[bool, str]:
     text = f'RMS {1e3 * found.rms:.3f} mm at the last {counted(found.configurations, "pose")}'
     if found.mistake:
         return False, verdict_in_words(found)
-    if updated.changed:
-        reasons = changes_in_words(updated.changed)
+    if updated.step or updated.changed:  # poses before and after a step look like many changes
+        reasons = updated.step or changes_in_words(updated.changed)
         return False, (
             f'the calibration in use no longer fits, {reasons}: was the robot, the target or the '
             f'device bumped? {text}; call ~/clear, measure 8 poses or more, and call ~/identify '

@@ -12,7 +12,9 @@ from verified import in_words, verification_page
 from calib_ros.apply.confidence import judge
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
+from calib_ros.decision.changes import Explanation
 from calib_ros.decision.comparison import Comparison, Residuals
+from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.noise import Noise
 from calib_ros.files.rows import Filing, verification_row
@@ -20,6 +22,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.report import words
 from calib_ros.report.advice import FAR, SPREAD_OUT
 from calib_ros.report.reports import CLOSER, may_be_closer
@@ -96,6 +99,23 @@ def test_a_mistake_is_named_instead_of_a_verdict():
     assert 'correct the publisher' in told  # not by options of the command line
     update = Recalibration(calibration, (), 1.0, found.comparison, 1e-4, 1e-4, 0.0)
     assert still_holds(update, found) == (False, told)  # ~/check said that they agree
+
+
+def test_a_bump_between_the_poses_checked_is_named_alone():
+    """Poses before and after it look like changes of several joints."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(0)
+    calibration = Calibration(arm, arm, residual=1e-4)
+    seen = measure(arm, arm.random_joints(10, rng), rng, 5e-5, 2e-4)
+    found = judge(calibration, [seen], of_messages=True)
+    what, at = 'elbow_joint', {'set': 0, 'sample': 5, 'stamp_ns': 6 * 10**9, 'unused': ''}
+    step = Step(what, 'joint', 'the joint', size=1e-3, unit='rad', share=0.9, where='line 7', **at)
+    names = (Parameter('wrist_1_joint.a'),)
+    other = Explanation('wrist_1_joint', names, 9.0, 0.0, 1.0, np.ones(1), np.ones(1))
+    update = Recalibration(calibration, ((other,),), 0.0, found.comparison, 1e-4, 1e-4, 0.0)
+    assert 'wrist_1_joint' in still_holds(update, found)[1]
+    _, told = still_holds(replace(update, step=step), found)
+    assert 'no longer fits, the zero of elbow_joint moved by 1 mrad before line 7: was' in told
+    assert 'wrist_1_joint' not in told
 
 
 @pytest.mark.parametrize(('bumped', 'verdict'), [(0.0, 'holds'), (5e-3, 'does not hold')])
