@@ -145,8 +145,7 @@ class Identifying:
         except InputError as err:
             why = [] if session.samples else inputs.failures
             told = InputError('; '.join((*why, str(err))))
-            self._failed(told)
-            self._short = '; '.join(why), '', ''
+            self._failed(told, '; '.join(why))
             raise told from err
         samples = tuple(session.usable)
         origin = {
@@ -178,12 +177,12 @@ class Identifying:
                 result = given.loaded.identified(given.settings.model, self.progress)
             return self._judged(given, result)
         except Exception as err:
-            self._failed(err)
-            self._short = str(err), next((each.status for each in given.hints), ''), ''
+            self._failed(err, str(err), next((each.status for each in given.hints), ''))
             raise
 
-    def _failed(self, err: Exception) -> None:
+    def _failed(self, err: Exception, said: str, advice: str = '') -> None:
         self.earlier, self.last = ONE_BEFORE, f'no result: {trouble(err)}'
+        self._short = said, advice, ''
 
     def _judged(self, given: Snapshot, result: Identification) -> Answer:
         loaded = given.loaded
