@@ -119,14 +119,14 @@ def usage(program: str) -> argparse.ArgumentParser:
     """Return a parser of the non-ROS arguments: only --help, which lists the parameters."""
     lines = ['parameters:']
     for each in PARAMETERS.values():
-        text = textwrap.indent(textwrap.fill(_described(each), 84), ' ' * 6)
+        text = textwrap.indent(textwrap.fill(_described(each), 74), ' ' * 6)
         lines += [f'  {each.name}{"" if each.fixed else " *"}', text]
-    lines += ['', '* can change while the node runs: ros2 param set /' + program + ' NAME VALUE']
+    changes = f'can change while the node runs: ros2 param set /{program} NAME VALUE'
+    lines += ['', 'from a file: --params-file FILE', f'* {changes}']
     return argparse.ArgumentParser(
         prog=program,
-        usage='%(prog)s --ros-args -p chain:=ur10e [-p NAME:=VALUE ...] [--params-file FILE]',
-        description='Calibrate a robot from its joint states and measured poses. Services, '
-        'topics and files: docs/node.md',
+        usage='%(prog)s --ros-args -p chain:=ur10e [-p NAME:=VALUE ...]',
+        description='Calibrate a robot from its joint states and measured poses (docs/node.md).',
         epilog='\n'.join(lines),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -208,6 +208,7 @@ def test_help_names_every_parameter_and_starts_nothing(capsys):
         mark = ' *' if can_change and name not in STARTUP else ''
         assert f'\n  {name}{mark}\n' in out
     assert '--ros-args -p chain:=ur10e' in out
+    assert max(map(len, out.splitlines())) <= 80
 
 
 @pytest.mark.parametrize(
