@@ -66,7 +66,8 @@ def test_a_slip_is_told_by_its_image_and_line(identified):
     assert status == Status.NOT_ACCEPTED
     line = 2 + SLIPPED * len(POINTS)
     assert f'before image {SLIPPED + 1}, line {line} (if' in told
-    assert json.loads((out / 'result.json').read_text())['step']['image'] == SLIPPED
+    where = json.loads((out / 'result.json').read_text())['step']['where']
+    assert where.startswith(f'image {SLIPPED + 1}, line {line} (')
     assert '1. Measure more poses' not in told  # which would not help
     rows = (out / 'residuals.csv').read_text().splitlines()
     assert rows[0].startswith('line,')

@@ -234,14 +234,14 @@ def test_poses_outside_the_region_do_not_lead_to_more_of_them():
             1.4e-5,
             True,
             'may come from the arm and is not in the model, as if joints were off '
-            'by 0.014 mrad across their axes (one',
+            'by 0.014 mrad across their axes (standard',
         ),
         (
             2e-5,
             1.4e-5,
             False,
             'seems to come from the arm and is not in the model, as if joints '
-            'were off by 0.020 mrad about their axes and 0.014 mrad across their axes (one',
+            'were off by 0.020 mrad about their axes and 0.014 mrad across their axes (standard',
         ),
         (1e-8, 0.0, False, ''),
     ],
