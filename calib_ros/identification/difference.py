@@ -24,6 +24,7 @@ import numpy as np
 
 from calib_ros.annotated import as_annotated
 from calib_ros.decision import changes
+from calib_ros.decision.another import is_another
 from calib_ros.decision.changes import ChangeColumns, Explanation, Information
 from calib_ros.errors import InputError
 from calib_ros.estimation.evidence import size_group
@@ -50,7 +51,7 @@ class Difference(Shown):
     errors and unmodelled effects too. Predicted positions differ by `rms` [m] over the joint range
     in the best frames, by `limit` [m] at most (95 %); the first model cannot follow `left` [m] of
     it. `changed` lists the changes, each with those indistinguishable from it; `unexplained` is
-    the probability of the remaining difference.
+    the probability of the remaining difference, 0 if another robot is likelier.
     """
 
     names: tuple[Parameter, ...]
@@ -83,7 +84,7 @@ class Difference(Shown):
         if self.changed and self.unexplained > changes.FALSE_ALARM:
             reasons = changes.changes_in_words(self.changed)
             return f'{reasons}; nothing else: was it bumped? Predictions differ by {size}'
-        return f'many parameters differ, by {size}: identify again, and inspect the robot'
+        return f'many parameters differ, by {size}: are both of one robot? Identify again'
 
     def _repr_html_(self) -> str:
         return as_html(self.in_words(), (), (('parameter', 'change'), *self.rows()))
@@ -142,6 +143,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         left_over = every.marginalised(columns.spread(changed))
     changed = changes.likelier(every, columns, freedom, changed)
     left_over = every.marginalised(columns.spread(changed))
+    another = is_another(every, columns, changed, first.chain, first.before)
     predicted = changes.mean_square_change(chain, names)
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(change, square, 10 * SOME_POSES, method='eigh')
@@ -156,7 +158,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         float(np.sqrt(np.quantile(squares, CONFIDENT))),
         left,
         tuple(changed),
-        _chance(left_over, freedom, sum(len(each[0].names) for each in changed)),
+        0.0 if another else _chance(left_over, freedom, sum(len(e[0].names) for e in changed)),
     )
 
 
