@@ -161,8 +161,8 @@ class Recalibration(Shown):
             why = f'{self.odd} contradicts all others: without it they would be accepted'
             return why, 'measure it again, or leave it out'
         if self.another and not self.step and (self.explained or not self.far):
-            why = 'the new poses are rather those of another robot of the same type'
-            return why, f'check whose they are; if this robot was repaired, {ANEW}'
+            why = 'another robot of this type fits the new poses better than changes of this one'
+            return why, f'check whose they are; if they are of this one, {ANEW}'
         if (cause := self.outside) and self.explained:
             if not self.out_of_scale:
                 why = 'the arm bends as under another load than in the earlier calibration'
