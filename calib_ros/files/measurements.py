@@ -136,8 +136,6 @@ class Measurements:
             rows = sorted(row for same in open_rows.values() for row in same)
             found = self.select(np.array(rows, dtype=np.intp))
         stamps = found.stamps_ns
-        if (np.diff(stamps) > 0).all():
-            return found
         _, number = distinct_rows(np.column_stack([found.codes, found.frame_id[0]]))
         order = np.lexsort((number, stamps))
         again = (np.diff(stamps[order]) == 0) & (np.diff(number[order]) == 0)
@@ -156,8 +154,6 @@ class Measurements:
                 f'{self.path}, line {line}: more than {most} sessions, devices and targets; each '
                 'has a frame to be fitted'
             )
-        if self.frame_id[1] == ['']:
-            return
         kinds, number = distinct_rows(np.column_stack([self.codes[:, :2], self.frame_id[0]]))
         frames: dict[tuple[int, ...], list[str]] = {}
         for k, (*device, frame) in enumerate(kinds.tolist()):
@@ -286,8 +282,6 @@ def _stamps(columns: Columns) -> NDArray[np.int64]:
 
 
 def _devices(columns: Columns, kind: Index) -> Codes:
-    if not kind.any():
-        return columns.labels('device')
     labels = [columns.labels(name) for name in ('device', 'plane', 'location', 'socket')]
     kinds, number = distinct_rows(np.column_stack([kind, *(codes for codes, _ in labels)]))
     names = []

@@ -87,8 +87,6 @@ def members(chain: _Arm, group: str) -> tuple[Parameter, ...]:
             for joint in chain.joints
         ],
     }
-    if group not in found:
-        raise UnknownNameError('group of effects', group, GROUPS)
     return tuple(found[group])
 
 

@@ -256,10 +256,8 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
     axis = np.zeros(3)
     if kind in MOVING_TYPES:
         axis = _numbers(_child(element, 'axis'), 'xyz', f'axis of {where}', '1 0 0')
-        size = np.abs(axis).max()
-        if size < SAME:  # a rounded zero
+        if np.abs(axis).max() < SAME:  # a rounded zero
             raise ConfigError(f'the axis of {where} has no direction')
-        axis = axis / size
         axis = axis / np.linalg.norm(axis)
     lower, upper = None, None
     limit = _child(element, 'limit')

@@ -64,8 +64,6 @@ def find_delay(
     farthest = Settings.lateness + Settings.max_gap  # beyond it, stamps show a moved clock
     begin = max(joint_times[0], times[0] - farthest)
     end = min(joint_times[-1], times[-1] + farthest)
-    if end - begin < LEAST_MOTION:
-        return None
     begin = max(begin, end - MOST_TIME)
     grid = np.arange(begin, end, STEP)
     coarse = np.interp(grid, joint_times, np.arange(len(joint_times)))

@@ -33,8 +33,6 @@ def interpolated(
     before, behind = first - 1, np.maximum(last, first + 1) + 1
     inner = (before >= 0) & (behind < rows.count)
     near = np.stack([first - 1, first, np.maximum(last, first + 1), behind])[:, inner]
-    if not near.size:
-        return joints, velocity, nothing
     times = (known[near] - stamps[inner]) * 1e-9  # (4, N)
     # no cubic over a pause in the samples
     even = np.diff(times, axis=0).max(axis=0) < 3.0 * np.diff(times, axis=0).min(axis=0)
