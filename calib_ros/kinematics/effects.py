@@ -207,13 +207,9 @@ def moved_joints(chain: _Arm, names: Sequence[str], phi: FloatArray, q: FloatArr
     values = [known[name] for name in names]
     q = couple_held(chain, q, couplings=False)
     shares = np.zeros((len(q), len(names)))
-    shares[_driven(tuple(names), chain.joint_names), np.arange(len(names))] = values
+    driven = [chain.joint_names.index(Parameter(name).owner) for name in names]
+    shares[driven, np.arange(len(names))] = values
     return np.asarray(q + shares @ phi)
-
-
-@lru_cache(maxsize=256)
-def _driven(names: tuple[str, ...], joint_names: tuple[str, ...]) -> list[int]:
-    return [joint_names.index(Parameter(name).owner) for name in names]
 
 
 @lru_cache(maxsize=256)

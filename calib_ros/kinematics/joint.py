@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -125,23 +125,16 @@ class Frame:
         matrix[:3, 3] += [offsets.get(kind, 0.0) for kind in FRAME_KINDS[:3]]
         turn = [offsets.get(kind, 0.0) for kind in FRAME_KINDS[3:]]
         if any(turn):
-            matrix[:3, :3] = se3.turned(*turn) @ matrix[:3, :3]
+            matrix[:3, :3] = se3.exp_rotation(np.array(turn)) @ matrix[:3, :3]
         later = (self.delay or 0.0) + offsets[DELAY] if DELAY in offsets else self.delay
         seen = {kind: offsets[kind] for kind in LENS_KINDS if kind in offsets}
         return Frame(matrix, self.fixed, later, self.lens and self.lens.moved(seen))
 
     def offsets(self, reference: Frame | None = None) -> FloatArray:
         """Return the move (6,) from `reference`: x, y, z [m] and a rotation vector [rad]."""
-        return _offsets(self, reference or ANYWHERE)
-
-
-@lru_cache(maxsize=256)
-def _offsets(frame: Frame, reference: Frame) -> FloatArray:
-    start = reference.matrix
-    turn = se3.log_rotation(frame.matrix[:3, :3] @ start[:3, :3].T)
-    found = np.concatenate([frame.matrix[:3, 3] - start[:3, 3], turn])
-    found.setflags(write=False)
-    return found
+        start = (reference or ANYWHERE).matrix
+        turn = se3.log_rotation(self.matrix[:3, :3] @ start[:3, :3].T)
+        return np.concatenate([self.matrix[:3, 3] - start[:3, 3], turn])
 
 
 ANYWHERE = Frame()
