@@ -125,7 +125,7 @@ class Frame:
         matrix[:3, 3] += [offsets.get(kind, 0.0) for kind in FRAME_KINDS[:3]]
         turn = [offsets.get(kind, 0.0) for kind in FRAME_KINDS[3:]]
         if any(turn):
-            matrix[:3, :3] = se3.exp_rotation(np.array(turn)) @ matrix[:3, :3]
+            matrix[:3, :3] = se3.turned(*turn) @ matrix[:3, :3]
         later = (self.delay or 0.0) + offsets[DELAY] if DELAY in offsets else self.delay
         seen = {kind: offsets[kind] for kind in LENS_KINDS if kind in offsets}
         return Frame(matrix, self.fixed, later, self.lens and self.lens.moved(seen))

@@ -8,6 +8,7 @@ radians. Transforms are homogeneous 4 x 4 matrices.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -57,6 +58,23 @@ def to_quat(rotation: FloatArray) -> FloatArray:
 def exp_rotation(vector: FloatArray) -> FloatArray:
     """Turn (..., 3) rotation vectors [rad] into (..., 3, 3) rotation matrices."""
     return _each(vector, (3,), lambda flat: Rotation.from_rotvec(flat).as_matrix(), (3, 3))
+
+
+def turned(x: float, y: float, z: float) -> FloatArray:
+    """Return the rotation matrix (3, 3) of one rotation vector [rad] (Rodrigues)."""
+    angle = math.hypot(x, y, z)
+    # sin(a) / a and (1 - cos(a)) / a^2, without loss of digits
+    half = math.sin(0.5 * angle) / (0.5 * angle) if angle > 0.0 else 1.0
+    first, second = math.sin(angle) / angle if angle > 0.0 else 1.0, 0.5 * half * half
+    xy, xz, yz = second * x * y, second * x * z, second * y * z
+    x, y, z, xx, yy, zz = first * x, first * y, first * z, x * x, y * y, z * z
+    return np.array(
+        [
+            [1.0 - second * (yy + zz), xy - z, xz + y],
+            [xy + z, 1.0 - second * (xx + zz), yz - x],
+            [xz - y, yz + x, 1.0 - second * (xx + yy)],
+        ]
+    )
 
 
 def cos_sin(angles: FloatArray) -> tuple[FloatArray, FloatArray]:

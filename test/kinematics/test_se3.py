@@ -26,6 +26,7 @@ def test_a_turn_is_the_exponential(angle, seed):
     axis = np.random.default_rng(seed).normal(size=3)
     vector = angle * axis / np.linalg.norm(axis)
     expected = expm(se3.skew(vector))
+    np.testing.assert_allclose(se3.turned(*vector), expected, rtol=0.0, atol=1e-14)
     np.testing.assert_allclose(se3.exp_rotation(vector), expected, rtol=0.0, atol=1e-14)
 
 
