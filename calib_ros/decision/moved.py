@@ -61,7 +61,8 @@ class Step:
     @property
     def outdated(self) -> bool:
         """Tell whether the frame found is that before the step."""
-        return self.kind in FRAMES and self.unused == FROM_THERE and not self.slow
+        of_frame = self.kind in FRAMES and self.kind != ZERO  # the device may stand where it was
+        return of_frame and self.unused == FROM_THERE and not self.slow
 
     @property
     def _size(self) -> str:
@@ -72,7 +73,7 @@ class Step:
         again = ', measure again after ~/clear'
         if self.kind in OF_THE_ARM:
             return f'{OF_THE_ARM[self.kind]} changed before pose {number}{again}'
-        what = f'the zero of {self.what}' if self.kind == 'joint' else self.what
+        what = f'the zero of {self.what}' if self.kind in ('joint', ZERO) else self.what
         moved = f'moved {self._size} before pose {number}'
         if self.outdated:
             return f'{what} is outdated: it {moved}{again}'

@@ -10,7 +10,7 @@ from fits import NOISE, SIGMAS, UR10E, arm, at_stations, measured_arm
 
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
-from calib_ros.decision import steps
+from calib_ros.decision import moved, steps
 from calib_ros.decision.moved import place_of, thing_of
 from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
@@ -198,7 +198,9 @@ def test_zeros_of_draw_wires_that_jump_are_named_one_or_all(jumping):
     assert (step.kind, step.sample, step.slow) == ('zero', AT, False)
     assert step.what == ', '.join(f'base_{k}' for k in jumping)
     assert step.size == pytest.approx(1e-3, rel=0.1)
-    assert str(step).startswith(f'the zero of {step.what} moved by')
+    for told in (str(step), step.told(AT + 1)):
+        assert told.startswith(f'the zero of {step.what} moved by')
+    assert not replace(step, unused=moved.FROM_THERE).outdated  # the device stands where it was
 
 
 def test_another_load_from_the_first_pose_on_is_no_step_of_an_arm_that_is_held():
