@@ -4,6 +4,7 @@
 and rows that are not like the others.
 """
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -120,8 +121,8 @@ def test_a_few_rows_in_another_unit_are_named(rows, where, oriented):
         assert ' -- or ' not in found
     many = Problem(arm, replace(seen, joints=np.where(some, np.degrees(q), q)), of_messages=True)
     told = str(diagnose_alone(many, true))
-    place = f'in poses {where} of 40 alone'
-    assert told.startswith(f'{place}, the joint values are in degrees, not ')
+    place = re.sub(r'(\d+)', r'\1.000 s', where)
+    assert told.startswith(f'in poses of {place} alone, the joint values are in degrees, not ')
     assert ': correct the publisher and measure again' in told
 
 
