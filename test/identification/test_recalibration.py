@@ -56,12 +56,14 @@ def test_distances_show_a_slipped_zero_of_a_wobbling_arm(earlier):
     assert {each.owner for reasons in found.changed for each in reasons} == {'elbow_joint'}
 
 
-def test_poses_of_another_robot_are_told():
+@pytest.mark.parametrize(('seed', 'count', 'away'), [(10, 8, 0.0), (11, 10, 3e-3)])
+def test_poses_of_another_robot_are_told(seed, count, away):
     """Three links that seemed bent explained them: the calibration became that of the other."""
     true = arm(0, errors=0.2)
     previous = Calibration.of(identify(problem(true, 60, 0)))
-    other = replace(arm(10, errors=0.2), base=true.base, tool=true.tool)
-    found = recalibrate(previous, problem(other, 8, 1), 0.1)
+    base = replace(true.base, matrix=true.base.matrix + away * np.eye(4, k=3))
+    other = replace(arm(seed, errors=0.2), base=base, tool=true.tool)
+    found = recalibrate(previous, problem(other, count, 1), 0.1)
     assert replace(found, another=False).accepted
     assert not found.accepted
     assert found.refusal()[0].startswith('another robot')
