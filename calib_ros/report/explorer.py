@@ -67,6 +67,7 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
         'total': len(poses),
         'oriented': poses.oriented,
         'kinds': kinds,
+        'number': (rows + 1).tolist() if many else None,
         'lines': poses.by_line,
         'clock': poses.timed,
         'things': poses.things,

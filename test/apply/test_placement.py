@@ -10,7 +10,7 @@ from calib_ros import Calibration, Chain, Problem, identify
 from calib_ros.apply import workspace
 from calib_ros.apply.workspace import in_base, place, task_of
 from calib_ros.cli.workspace import _task
-from calib_ros.errors import ConfigError, InputError
+from calib_ros.errors import CalibrationError, ConfigError, InputError
 from calib_ros.kinematics.chain import Joint
 from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.se3 import exp_rotation, transform
@@ -142,7 +142,7 @@ def test_a_task_out_of_reach_is_refused(arm):
     with pytest.raises(InputError, match='cannot reach all 6 poses of the task in any'):
         place(arm, far, cells=3)
     for x, said in ((0.2, 'give the lower corner first'), (np.nan, 'region must not hold NaN')):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(CalibrationError, match=said):
             place(arm, TASK, region=np.array([[0.3, -1.0, 0.0], [x, 1.0, 1.0]]))
 
 

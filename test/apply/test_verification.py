@@ -22,7 +22,7 @@ from calib_ros.kinematics.se3 import invert
 from calib_ros.report.verdicts import _by_configuration, standing
 from calib_ros.shown import rounded
 
-_UNIT = ['(mean', '+', '3', 'sigma)']
+_UNIT = ['(mean', '+', '3', 'std)']
 
 
 @pytest.fixture(scope='module')

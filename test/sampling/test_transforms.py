@@ -214,7 +214,7 @@ def test_bad_transforms_are_counted_if_they_are_of_the_pair(rng, big_endian):
     assert account.poses == 2
     (cause,) = account.dropped
     assert account.dropped[cause] == 1
-    assert cause.startswith('measurements: zero stamp')
+    assert cause.startswith('measurements: negative stamp')
 
 
 def session_fed(come, little_endian=True, at_once=True):

@@ -62,6 +62,7 @@
   const unpacked = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
   for (const [name, text] of Object.entries(e.arrays)) floats[name] = new Float32Array(unpacked(text));
   const stamps = new BigInt64Array(unpacked(e.stamps)), count = stamps.length;
+  const number = (i) => (e.number ? e.number[i] : i + 1);
   const source = (i) => {
     if (e.images[i]) return e.images[i];
     if (e.lines) return 'line ' + stamps[i] / 1000000000n;
