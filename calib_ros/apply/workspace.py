@@ -247,7 +247,7 @@ class _Search:
         errors = np.full((len(placements), self._starts), np.nan)
         expected = self._arm.expected(joints[reached].reshape(-1, joints.shape[-1]), self._model)
         expected = expected.reshape(-1, len(self._task))
-        errors[reached] = (np.mean if self._aim == 'mean' else np.max)(expected, axis=1)
+        errors[reached] = expected.mean(axis=1) if self._aim == 'mean' else expected.max(axis=1)
         best = np.where(np.isnan(errors), np.inf, errors).argmin(axis=1)
         index = np.arange(len(placements))
         return errors[index, best], joints[index, best]

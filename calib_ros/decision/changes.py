@@ -367,7 +367,7 @@ def gauge_map(
     q = chain.random_joints(SOME_POSES, rng)
     frames = [n for end in ('base', 'tool') for n in parameters_of(end)] if free else []
     fitted = list(dict.fromkeys([*frames, *names]))
-    approach = rng.choice([-1.0, 1.0], q.shape)
+    approach = rng.choice(np.array([-1.0, 1.0]), q.shape)
     turned = any(n.kind in FRAME_KINDS[3:] and not n.owner.startswith('base') for n in fitted)
     lever = LEVER if turned else 0.0  # positions do not show turns of the target
     taken, wanted, left = best_imitation(chain, fitted, others, q, lever, approach=approach)

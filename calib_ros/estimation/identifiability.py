@@ -100,7 +100,8 @@ def drawn(
     frames = [name for name in names if chain.owns_frame(name)]
     places = rng.uniform(0.1, 0.5, len(frames))
     anywhere = chain.with_offsets(dict(zip(frames, places, strict=True)))
-    approach, velocity = rng.choice([-1.0, 1.0], joints.shape), rng.normal(size=joints.shape)
+    approach = rng.choice(np.array([-1.0, 1.0]), joints.shape)
+    velocity = rng.normal(size=joints.shape)
     rows = []
     for number, each in enumerate(sets):
         posed = joints

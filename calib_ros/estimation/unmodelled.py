@@ -152,7 +152,7 @@ def _size_of_waves(
 
 
 def _variances(
-    products: FloatArray, offsets: FloatArray, precision: FloatArray, counts: Index
+    products: FloatArray, offsets: FloatArray, precision: FloatArray, counts: FloatArray | Index
 ) -> tuple[FloatArray, FloatArray]:
     """Return the variance (K,) of noise by part of so many rows; zero if they are too few.
 

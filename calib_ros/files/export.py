@@ -300,7 +300,7 @@ def checked(name: str, text: str, again: FloatArray, wanted: FloatArray, lost: f
 
 def distance(first: Chain, second: Chain, joints: FloatArray) -> float:
     """Return the largest distance [m] of two arms at joint values (N, n), by any last moves."""
-    moves = np.random.default_rng(0).choice([-1.0, 1.0], joints.shape)
+    moves = np.random.default_rng(0).choice(np.array([-1.0, 1.0]), joints.shape)
     apart = first.forward(joints, moves)[:, :3, 3] - second.forward(joints, moves)[:, :3, 3]
     return float(se3.norms(apart).max())
 

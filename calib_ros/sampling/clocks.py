@@ -104,7 +104,7 @@ class Clocks:
         for rows in (joints, *poses):
             rows.sort()
         measured = [(rows.stamps, rows.values) for rows in poses]
-        stand = np.ptp(joints.values, axis=0).max() <= self.settings.still
+        stand = bool(np.ptp(joints.values, axis=0).max() <= self.settings.still)
         deaf = stand and bool(poses) and all(map(self._moves_much, poses))
         self._deaf += deaf
         self._stuck = deaf or (stand and self._stuck)
