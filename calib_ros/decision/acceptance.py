@@ -190,18 +190,19 @@ def out_of_scale(scale: float, printed: bool = False, checked: bool = False) -> 
     Of a `printed` board it is that of its stated size.
     """
     way, size = ('grow', 'large') if scale > 0.0 else ('shrink', 'small')
-    text = f'all lengths of the arm {way} alike, by {percent(abs(scale))} %, '
+    grown = f'all lengths of the arm {way} alike, by {percent(abs(scale))} %'
     if checked:
         return (
-            f'{text}more than sigma_scale allows: measure a known length, or the printed board, '
-            'again'
+            f'{grown}, more than sigma_scale allows: measure a known length, or the printed '
+            'board, again'
         )
-    cause, check = 'the measuring device were out of scale', 'If a known length shows that its'
+    text = f'{grown}, as if the measuring device were out of scale; then'
+    check = 'If a known length shows that its'
     if printed:
-        cause, check = f'the board were stated too {size}', 'Measure the print; if its'
-    text += f'as if {cause}; then'
-    if printed and abs(scale) < LARGEST_SCALE:  # as arms are
-        text = 'the size of the board is not known well enough:'
+        check = 'Measure the print; if its'
+        text = f'{grown}, as if the board were stated too {size}; then'
+        if abs(scale) < LARGEST_SCALE:  # as arms do
+            text = 'the size of the board is not known well enough:'
     return (
         f'{text} the correction may make the arm worse. {check} scale is right, set sigma_scale '
         '(--sigma-scale) to its accuracy'

@@ -14,7 +14,9 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.shown import are_lines, moment, rows_in_words
 
 ZERO = 'zero'  # of the distances of a device
-FRAMES = ('base', 'tool', ZERO)
+FRAMES = ('base', 'tool')
+IN_THE_CELL = (*FRAMES, ZERO)  # beside the arm
+ZEROS = ('joint', ZERO)
 FROM_THERE = 'from there on'
 OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
 
@@ -53,7 +55,7 @@ class Step:
     @property
     def harmful(self) -> bool:
         """Tell whether the step spoils the fit: it mixes two arms, or describes a past one."""
-        return not self.slow and (self.kind not in FRAMES or not self.unused)
+        return not self.slow and (self.kind not in IN_THE_CELL or not self.unused)
 
     def __str__(self) -> str:
         return str(self.reason)
@@ -61,8 +63,7 @@ class Step:
     @property
     def outdated(self) -> bool:
         """Tell whether the frame found is that before the step."""
-        of_frame = self.kind in FRAMES and self.kind != ZERO  # the device may stand where it was
-        return of_frame and self.unused == FROM_THERE and not self.slow
+        return self.kind in FRAMES and self.unused == FROM_THERE and not self.slow
 
     @property
     def _size(self) -> str:
@@ -73,7 +74,7 @@ class Step:
         again = ', measure again after ~/clear'
         if self.kind in OF_THE_ARM:
             return f'{OF_THE_ARM[self.kind]} changed before pose {number}{again}'
-        what = f'the zero of {self.what}' if self.kind in ('joint', ZERO) else self.what
+        what = f'the zero of {self.what}' if self.kind in ZEROS else self.what
         moved = f'moved {self._size} before pose {number}'
         if self.outdated:
             return f'{what} is outdated: it {moved}{again}'
@@ -87,7 +88,7 @@ class Step:
             off = f'the {self.what} held by the chain file is off {size}'
             return Reason(Rule.MISTAKE, f'{off}: correct it, or remove fixed: true there')
         thing, of = self.thing, f' ({self.what})'
-        if self.kind in ('joint', ZERO):
+        if self.kind in ZEROS:
             thing, of = f'the zero of {self.what}', ''
         text, more = f'{thing} moved {size}{of} before {self.where}', ''
         if self.slow:
@@ -124,7 +125,7 @@ def place_of(problem: Problem, number: int, sample: int) -> str:
 
 def thing_of(kind: str, seen: Observations) -> str:
     """Return what moves with a frame, in words; `kind` as in `Step`."""
-    if kind not in FRAMES:
+    if kind not in IN_THE_CELL:
         return OF_THE_ARM.get(kind, 'the joint')
     of_images = seen.pixels is not None
     target = ['the board' if of_images else 'the target']

@@ -24,9 +24,10 @@ import numpy as np
 from calib_ros.decision.drift import slow_cosines
 from calib_ros.decision.imitations import LEAST, Imitation
 from calib_ros.decision.moved import (
-    FRAMES,
     FROM_THERE,
+    IN_THE_CELL,
     ZERO,
+    ZEROS,
     Moving,
     Step,
     groups_of,
@@ -68,13 +69,13 @@ def find_step(fitted: Fitted) -> Step | None:
         scan, found = _searched(fitted, loaded=True)
     if found is not None:
         if scan.drifts(found):
-            creeps = found.stop and found.group.kind in FRAMES
+            creeps = found.stop and found.group.kind in IN_THE_CELL
             if not creeps or fitted.problem.sets[found.group.sets[0]].socket:
                 return None
             found = replace(found, size=2.0 * found.size, slow=True)  # the halves' means differ
         return scan.described(found)
     found = scan.imitated(fitted)
-    torn = found is not None and found.group.kind in FRAMES and scan.torn
+    torn = found is not None and found.group.kind in IN_THE_CELL and scan.torn
     if found is not None and not torn and fitted.robust.outliers.any():
         scan = _Scan(fitted, loaded=bends, gross=False)  # these gross errors are no move
         found = scan.imitated(fitted)
@@ -245,7 +246,7 @@ class _Scan:
         arm = Imitation(fitted, self._names[: self._fitted], self._products)
         highest, found = LEAST, None
         known = {*fitted.problem.given} | {*self._added} - {*fitted.problem.free}
-        groups = [g for g in self._groups if g.kind in FRAMES and not g.held]
+        groups = [g for g in self._groups if g.kind in IN_THE_CELL and not g.held]
         groups += [g for g in self._groups if g.kind == 'joint' and known.isdisjoint(g.names)]
         trials = np.log(self._stops * len(self._groups))
         for group in groups:
@@ -339,7 +340,7 @@ class _Scan:
         change = np.sqrt(((np.concatenate(moved) @ found.size[known]) ** 2).mean(axis=0))
         size, turn = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
         unit, oriented = 'm', any(each.turned for each in problem.sets)
-        if group.kind in ('joint', ZERO):
+        if group.kind in ZEROS:
             size, unit = float(np.abs(found.size).max()), Parameter(group.names[0]).unit
         elif oriented and turn * problem.sigma_position > size * problem.sigma_orientation:
             size, unit = turn, 'rad'

@@ -18,7 +18,7 @@ from visualization_msgs.msg import MarkerArray
 from calib_ros.apply.confidence import interval_of
 from calib_ros.decision.comparison import compare
 from calib_ros.decision.misfits import Outlier
-from calib_ros.decision.moved import FRAMES, Step
+from calib_ros.decision.moved import IN_THE_CELL, Step
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
 from calib_ros.errors import LONGEST, ConfigError, InputError, shortened, trouble
@@ -264,7 +264,7 @@ class Identifying:
 def _moved(result: Identification, given: Snapshot) -> str:
     """Tell what moved, if the result is accepted, or refused for that."""
     step, refusals = result.step, result.refusals
-    if step is None or step.slow or (refusals and given.cause and step.kind in FRAMES):
+    if step is None or step.slow or (refusals and given.cause and step.kind in IN_THE_CELL):
         return ''
     if refusals and refusals[0].rule not in (Rule.MOVED, Rule.ENCODER):
         return ''
