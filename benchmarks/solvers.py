@@ -143,7 +143,7 @@ def scipy(given):
     """Fit with scipy's least squares; the Jacobian is that of our error model, all at once."""
     from scipy.optimize import least_squares
 
-    from calib_ros.decision.comparison import residuals
+    from calib_ros.decision.residuals import residuals
     from calib_ros.kinematics.jacobian import ErrorModel
 
     start, names, sigmas = _start(given)

@@ -33,7 +33,7 @@ from calib_ros.apply.confidence import freedom_of, rms_limits
 from calib_ros.apply.design import Design
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.apply.verification import verify
-from calib_ros.decision.comparison import residuals
+from calib_ros.decision.residuals import residuals
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision.comparison import residuals
+from calib_ros.decision.residuals import residuals
 from calib_ros.estimation import fitting
 from calib_ros.estimation.fitted import parameter_rows
 from calib_ros.estimation.leastsquares import minimise

@@ -25,8 +25,9 @@ from calib_ros.annotated import Confidence, InMetres, as_annotated
 from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import Judgement, judge, limits_of, moments_of, rms_of
-from calib_ros.decision.comparison import Comparison, along_base, axes_of, by_axes, compare
+from calib_ros.decision.comparison import Comparison, along_base, compare
 from calib_ros.decision.moved import Step
+from calib_ros.decision.residuals import axes_of, by_axes
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import CONFIDENT

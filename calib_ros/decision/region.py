@@ -1,47 +1,25 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a calibration may be used: where it improves the arm, also away from its poses.
-
-By the posterior of the arm (`evidence.py`) its true offsets from nominal are x ~ N(m, C); those of
-the calibration are x^. At poses with the Jacobian A, base and tool frames projected out, it makes
-the arm worse if
-
-    |A (x^ - x)|^2 > |A x|^2    <=>    (A x^)^T (A x) < |A x^|^2 / 2
-
-Waves of its axes are among x, and x^ has none. The probability of that is the *risk*;
-docs/model.md (Region) describes the poses it is computed for.
-"""
+"""The joint values at which a calibration may be used."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from scipy import special
 
-from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.estimation.evidence import MixtureTerm, Posterior
-from calib_ros.estimation.gain import inverse_root
+from calib_ros.decision.matrices import damage_error, packed, parse_rows, rows_of, unpacked_matrix
+from calib_ros.errors import UnknownNameError
 from calib_ros.estimation.joint_errors import (
     NOTHING,
-    axis_parameters,
-    turns_and_tilts,
-    wobble_columns,
 )
-from calib_ros.estimation.levels import KNOWN
-from calib_ros.estimation.observations import SOME_POSES, Observations
-from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, Flags, FloatArray
+from calib_ros.kinematics.parameter import Parameter
+from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.shown import Shown
-
-RISK = 0.02
-"""Largest probability that the arm gets worse over the poses of a shell (benchmarks/harm.py)."""
-SHELL = SOME_POSES // 20  # random configurations per shell
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -109,47 +87,6 @@ class Region(Shown):
         }
 
 
-def packed(square: FloatArray) -> list[str]:
-    """Return the rows of the lower Cholesky factor of a positive matrix (P, P) as text."""
-    scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
-    scaled = square / np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
-    root = scale[:, np.newaxis] * np.linalg.cholesky(scaled)
-    return rows_of([row[: k + 1] for k, row in enumerate(root)])
-
-
-def rows_of(matrix: Iterable[FloatArray]) -> list[str]:
-    """Return the rows of a matrix (P, K) as text, for `parse_rows`."""
-    return [' '.join(f'{x:.9e}' for x in row) for row in matrix]
-
-
-def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> FloatArray:
-    """Return the matrix (P, K) of rows of numbers, up to the diagonal if `triangular`.
-
-    Raises ValueError if the number or length of the rows is wrong, or a value is not finite.
-    """
-    numbers = [np.array(row.split(), dtype=np.float64) for row in rows]
-    first = [len(row) for row in numbers[:1]]
-    widths = [*range(1, count + 1)] if triangular else first * count
-    if [*map(len, numbers)] != widths or not all(np.isfinite(row).all() for row in numbers):
-        raise ValueError(f'{len(rows)} rows of finite numbers for {count} names')
-    matrix = np.zeros((count, max(widths, default=0)))
-    for row, given in zip(matrix, numbers, strict=True):
-        row[: len(given)] = given
-    return matrix
-
-
-def unpacked_matrix(rows: Sequence[str], size: int) -> FloatArray:
-    """Return the matrix (P, P) from the rows of `packed`."""
-    root = parse_rows(rows, size, triangular=True)
-    return np.asarray(root @ root.T)
-
-
-def damage_error(key: str, where: str, err: Exception | None = None) -> ConfigError:
-    """Return the error for a damaged part of a record."""
-    kind = '' if err is None else f' ({type(err).__name__})'
-    return ConfigError(f'{where}: calibration.{key} is damaged{kind}: identify again')
-
-
 def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Region | None:
     """Return the region in the record of a calibration, or None.
 
@@ -185,99 +122,3 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
     if not (region.limit > 0.0 and 0.0 <= region.share <= 1.0):
         raise damage_error('region', where)
     return region
-
-
-def region_of(
-    posterior: Posterior, sets: Sequence[Observations], freedom: float, largest: float
-) -> Region | None:
-    """Return where a calibration may be used; None if not even at the measured poses.
-
-    `freedom` are the degrees of freedom of the noise estimate; away from the measured poses the
-    expected error is `largest` [m] at most.
-    """
-    ends = sets[0].base, sets[0].tool
-    measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
-    drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    judge = _Judge(posterior, *ends, freedom)
-    rows = judge.rows(np.concatenate([drawn, measured]))
-    known = rows[: len(posterior.names)]
-    squares = np.einsum('pcn,pcn->n', np.tensordot(posterior.square, known, 1), known)
-    sizes = np.sqrt(np.maximum(squares, 0.0))  # of the expected errors
-    sizes *= 1.0 + HALF_THE_DIGITS  # as rounded, also in the record
-    far, limit = sizes[:SOME_POSES], float(sizes[SOME_POSES:].max())
-    order = np.argsort(far)
-    own, inside = judge.products(rows[..., SOME_POSES:]), far[order] <= limit
-    inner = own + judge.products(rows[..., order[inside]])
-    mixture = judge.of_the_arm(posterior.mixture)
-    if not max(judge.risk(own, own, mixture), judge.risk(inner, inner, mixture)) < RISK:
-        return None
-    shells = order[~inside & (far[order] <= largest)]
-    for shell in np.split(shells, range(SHELL, len(shells), SHELL)):
-        added = judge.products(rows[..., shell])
-        if not judge.risk(added, inner + added, mixture) < RISK:
-            break
-        inner, limit = inner + added, float(far[shell[-1]])
-    by_scale = 0.0
-    if posterior.rival is not None:
-        odds, mean, covariance = posterior.rival
-        out = float(special.expit(odds))
-        mixture = judge.of_the_arm([(1.0, mean, covariance)])
-        by_scale = out * max(judge.risk(own, own, mixture), judge.risk(inner, inner, mixture))
-    share = float(np.mean(far <= limit))
-    if share == 1.0 and not any(joint.guessed for joint in posterior.chain.joints):
-        limit = np.inf
-    arm = posterior.chain, posterior.names, posterior.square, posterior.device
-    return Region(*arm, limit, share, *ends, by_scale)
-
-
-_Mixture: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-"""Weights (S,), means (S, A) and covariances (S, A, A) of the arm's A offsets."""
-
-
-class _Judge:
-    """Probability that a calibration makes the arm worse at some poses."""
-
-    def __init__(self, posterior: Posterior, base: str, tool: str, freedom: float) -> None:
-        chain, names = posterior.chain, posterior.names
-        arm = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
-        frames = [*parameters_of(base), *parameters_of(tool)[:3]]
-        self._placed, self._freedom = len(frames), freedom
-        every = list(dict.fromkeys([*names, *frames, *axis_parameters(chain)]))
-        self._model, self._waves = ErrorModel(chain, every, base, tool), posterior.unmodelled.waves
-        waves = range(len(posterior.mixture[0][1]) - len(names))
-        self._arm = [*arm, *(len(names) + k for k in waves)]
-        self._own = [*map(every.index, frames), *arm, *(len(every) + k for k in waves)]
-        self._offsets = np.append(posterior.offsets[arm], np.zeros(len(waves)))
-
-    def rows(self, joints: FloatArray) -> FloatArray:
-        """Return the columns (K, 3, N) of the posterior's names, of others, and of waves."""
-        rows = self._model.jacobian(joints)[:, :3].transpose(2, 1, 0)
-        _, tilts = turns_and_tilts(self._model.chain, self._model.names, rows)
-        return np.concatenate([rows, self._waves * wobble_columns(tilts, joints)])
-
-    def products(self, rows: FloatArray) -> FloatArray:
-        """Return products (K, K) of the columns of frames, then of the arm, from all rows."""
-        return gram(rows[self._own])
-
-    def of_the_arm(self, mixture: Sequence[MixtureTerm]) -> _Mixture:
-        """Return plausible offsets and waves, as in `Posterior.mixture`, for the arm only."""
-        weights, means, covariances = zip(*mixture, strict=True)
-        arm = np.ix_(self._arm, self._arm)
-        own = np.array([each[arm] for each in covariances])
-        return np.array(weights), np.array(means)[:, self._arm], own
-
-    def risk(self, which: FloatArray, around: FloatArray, mixture: _Mixture) -> float:
-        """Return the risk at some poses, in frames fitted to poses around; by their products."""
-        frames, arm = np.s_[: self._placed], np.s_[self._placed :]
-        root = inverse_root(around[frames, frames], np.diag(around)[frames])
-        placed = -root @ (root.T @ (around[frames, arm] @ self._offsets))
-        pushed = which @ np.append(placed, self._offsets)
-        slope = pushed[arm] - around[arm, frames] @ (root @ (root.T @ pushed[frames]))
-        gain = float(slope @ self._offsets)
-        weights, means, covariances = mixture
-        margins = means @ slope - 0.5 * gain
-        along = covariances.reshape(means.size, len(slope)) @ slope
-        spreads = np.sqrt(np.maximum(along.reshape(means.shape) @ slope, 0.0))
-        with np.errstate(divide='ignore', invalid='ignore'):
-            risks = special.stdtr(min(self._freedom, KNOWN), -margins / spreads)
-        return float(weights @ np.where(spreads > 0.0, risks, margins <= 0.0))

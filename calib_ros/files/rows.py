@@ -17,7 +17,7 @@ import numpy as np
 
 import calib_ros
 from calib_ros.apply.confidence import Judgement, interval_of
-from calib_ros.decision.comparison import ErrorFigures
+from calib_ros.decision.residuals import ErrorFigures
 from calib_ros.decision.result import Identification
 from calib_ros.errors import LONGEST_NAME, ConfigError
 from calib_ros.estimation.observations import Observations

@@ -29,8 +29,9 @@ import numpy as np
 
 import calib_ros
 from calib_ros.annotated import as_annotated
+from calib_ros.decision.matrices import packed, rows_of
 from calib_ros.decision.moved import Step
-from calib_ros.decision.region import Region, packed, region_of_record, rows_of
+from calib_ros.decision.region import Region, region_of_record
 from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import find_step
 from calib_ros.errors import ConfigError, InputError

@@ -22,8 +22,9 @@ from calib_ros.decision.acceptance import oddities, refusals
 from calib_ros.decision.comparison import GroupVerdict, compare
 from calib_ros.decision.drift import chance_of_gain
 from calib_ros.decision.misfits import arms_own, coupling_share, outliers_of, zero_of_distances
-from calib_ros.decision.region import Region, region_of
+from calib_ros.decision.region import Region
 from calib_ros.decision.result import Identification
+from calib_ros.decision.risk import region_of
 from calib_ros.decision.rounding import may_be_rounding, rounded_joints, rounding_errors
 from calib_ros.decision.steps import find_step
 from calib_ros.decision.validation import held_out_excess, validate

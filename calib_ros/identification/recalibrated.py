@@ -11,8 +11,9 @@ import numpy as np
 
 from calib_ros.decision import changes
 from calib_ros.decision.changes import Explanation
-from calib_ros.decision.comparison import Comparison, ErrorFigures
+from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.moved import Step
+from calib_ros.decision.residuals import ErrorFigures
 from calib_ros.estimation.levels import ALIKE, CLEARLY
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.records import reused_in_words

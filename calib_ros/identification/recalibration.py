@@ -26,8 +26,9 @@ from calib_ros.annotated import NotNegative, as_annotated
 from calib_ros.decision import changes, mistakes
 from calib_ros.decision.another import is_another
 from calib_ros.decision.changes import SCALE_OF_DEVICE, ChangeColumns, Explanation, Information
-from calib_ros.decision.comparison import Comparison, compare, residuals
-from calib_ros.decision.validation import fold_residuals
+from calib_ros.decision.comparison import Comparison, compare
+from calib_ros.decision.cross_validation import fold_residuals
+from calib_ros.decision.residuals import residuals
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.considered import Nuisances, nuisance_products

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.decision.region import damage_error, parse_rows, unpacked_matrix
+from calib_ros.decision.matrices import damage_error, parse_rows, unpacked_matrix
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.noise import Noise

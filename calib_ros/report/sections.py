@@ -12,7 +12,8 @@ from datetime import datetime, timezone
 import numpy as np
 
 import calib_ros
-from calib_ros.decision.comparison import Comparison, ErrorFigures
+from calib_ros.decision.comparison import Comparison
+from calib_ros.decision.residuals import ErrorFigures
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, words

@@ -10,8 +10,9 @@ import numpy as np
 
 from calib_ros.apply.confidence import Judgement, interval_of
 from calib_ros.decision.changes import FALSE_ALARM, changes_in_words
-from calib_ros.decision.comparison import Comparison, ErrorFigures
+from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.misfits import Outlier
+from calib_ros.decision.residuals import ErrorFigures
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.noise import Noise

@@ -20,7 +20,7 @@ from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Float64MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker, MarkerArray
 
-from calib_ros.decision.comparison import residuals
+from calib_ros.decision.residuals import residuals
 from calib_ros.decision.result import Identification
 from calib_ros.errors import MOST_ENTRIES
 from calib_ros.estimation.observations import Observations

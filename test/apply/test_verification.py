@@ -14,7 +14,7 @@ from calib_ros.apply.candidates import iso_9283_poses
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.confidence import rms_interval, rms_limits
 from calib_ros.apply.verification import Attained, verify
-from calib_ros.decision.comparison import Residuals
+from calib_ros.decision.residuals import Residuals
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain

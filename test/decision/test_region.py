@@ -11,14 +11,9 @@ from fits import UR10E, arm, at_stations, rms
 
 from calib_ros import Calibration, Compensator, Problem, compensate, identify, load_calibration
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision import region
-from calib_ros.decision.region import (
-    packed,
-    parse_rows,
-    region_of,
-    region_of_record,
-    unpacked_matrix,
-)
+from calib_ros.decision.matrices import packed, parse_rows, unpacked_matrix
+from calib_ros.decision.region import region_of_record
+from calib_ros.decision.risk import region_of
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain_file import load_chain
@@ -195,7 +190,7 @@ def test_the_risk_is_the_larger_of_poses_and_those_known_as_well(local, near, in
         found = near if sizes[-1] == sizes[0] else inside
         return found if harmful[0] or (doubts[1] == 7.0).all() else 0.0
 
-    monkeypatch.setattr(region._Judge, 'risk', risk)
+    monkeypatch.setattr('calib_ros.decision.risk._Judge.risk', risk)
     assert region_of(posterior, sets, np.inf, np.inf).by_scale == 0.0
     found = region_of(replace(posterior, rival=rival), sets, np.inf, np.inf)
     assert found.by_scale == pytest.approx(0.3 / (1.0 + np.exp(-0.5)))

@@ -11,7 +11,7 @@ from fits import UR10E, measured_arm
 from scipy import stats
 
 from calib_ros import Problem, identify
-from calib_ros.decision.region import region_of
+from calib_ros.decision.risk import region_of
 
 
 @pytest.mark.parametrize('level', [0.5, 0.95])

@@ -11,11 +11,12 @@ from fits import UR10E, measured_arm
 from in_sockets import PLACES, cell
 from scipy import stats
 
-from calib_ros.decision import validation
+from calib_ros.decision import cross_validation, places, validation
 from calib_ros.decision.acceptance import refusals
-from calib_ros.decision.comparison import Comparison, Residuals, compare, log_gain, residuals
+from calib_ros.decision.comparison import Comparison, compare, log_gain
+from calib_ros.decision.cross_validation import fold_residuals
 from calib_ros.decision.reasons import Rule
-from calib_ros.decision.validation import fold_residuals
+from calib_ros.decision.residuals import Residuals, residuals
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import minimise
@@ -259,7 +260,7 @@ def test_folds_leave_enough_to_fit_and_some_to_spare(count, rows, names, known, 
         informed=frozenset(f'p{k}' for k in range(known)),
     )
     every = [*(f'p{k}' for k in range(names)), 'elbow_joint.ratio']
-    assert validation._fold_count(problem, every, count, rows) == wanted
+    assert cross_validation._fold_count(problem, every, count, rows) == wanted
 
 
 def test_held_out_pairs_at_fitted_configurations_are_repeated():
@@ -281,14 +282,14 @@ def test_places_a_known_distance_apart_are_one():
         sets=[SimpleNamespace(base=base) for base in 'abcabde'],
         separations=[('a', 'c', 1.0), ('c', 'a', 1.0), ('e', 'd', 2.0), ('d', 'a', 1.0)],
     )
-    assert validation._places(problem) == [{'b'}, {'a', 'c', 'd', 'e'}]
+    assert places.places_of(problem) == [{'b'}, {'a', 'c', 'd', 'e'}]
 
 
 def test_known_distances_count_in_the_places_that_are_fitted(monkeypatch):
     problem = cell(0, noise=1e-4)[1]
     fitted, systems = fit(problem), []
     monkeypatch.setattr(
-        validation, 'minimise', lambda *given: systems.append(given[2]) or minimise(*given)
+        places, 'minimise', lambda *given: systems.append(given[2]) or minimise(*given)
     )
     validation.validate(fitted, fitted.chain)
     assert [len(each.separations) for each in systems] == [PLACES - 1, 1] * 2 * PLACES

@@ -8,7 +8,7 @@ from fits import NOISE, SIGMAS, UR10E, fitted
 
 from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.decision.comparison import residuals
+from calib_ros.decision.residuals import residuals
 from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 

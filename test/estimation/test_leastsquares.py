@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.decision.comparison import residuals
+from calib_ros.decision.residuals import residuals
 from calib_ros.estimation import leastsquares
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.leastsquares import (

@@ -13,7 +13,7 @@ import yaml
 from fits import UR10E as UR, measured_arm
 
 from calib_ros.apply.simulation import measure
-from calib_ros.decision.region import unpacked_matrix
+from calib_ros.decision.matrices import unpacked_matrix
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.observations import Observations

@@ -13,9 +13,10 @@ from calib_ros.apply.confidence import judge
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
 from calib_ros.decision.changes import Explanation
-from calib_ros.decision.comparison import Comparison, Residuals
+from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision.residuals import Residuals
 from calib_ros.estimation.noise import Noise
 from calib_ros.files.rows import Filing, verification_row
 from calib_ros.identification.calibration import Calibration

@@ -1,0 +1,86 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Cross-validation: every configuration is judged by a fit without it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from calib_ros.decision.comparison import Comparison
+from calib_ros.decision.residuals import Residuals, joined, residuals
+from calib_ros.estimation.configurations import count_distinct
+from calib_ros.estimation.fitted import Fitted
+from calib_ros.estimation.leastsquares import leave_fold_out
+from calib_ros.estimation.levels import TELLING
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import Index
+
+
+def cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Comparison | None, str]:
+    """Judge both chains on folds of configurations that were not fitted; None if too few.
+
+    A `note` (why not by held-out pairs) stands behind the text.
+    """
+    problem, names = fitted.problem, fitted.names
+    groups = problem.configurations
+    count = count_distinct(np.concatenate(groups))
+    rows = sum(
+        count_distinct(group) * each.width
+        for group, each in zip(groups, problem.sets, strict=True)
+    )
+    folds = _fold_count(problem, names, count, rows)
+    if folds < 2:
+        return None, 'nothing: too few poses to hold any out'
+    frames = [name for name in names if before.owns_frame(name)]
+    numbers = [group % folds for group in groups]
+    order = [np.argsort(each, kind='stable') for each in numbers]
+    by_fold = fitted.system.select(order), [*map(np.sort, numbers)]  # sorted once
+    fits = (before, frames), (fitted.chain, names)
+    chains = zip(*(leave_fold_out(one, some, *by_fold) for one, some in fits), strict=True)
+    first, second = fold_residuals(chains, problem.sets, groups, numbers)
+    judged = Comparison(first, second, ~fitted.robust.outliers)
+    over = f'{folds}-fold cross-validation over {count:,} different poses'
+    return judged, f'{over}{note}{judged.omitted}'
+
+
+def fold_residuals(
+    chains: Iterable[tuple[Chain, Chain]],
+    sets: Sequence[Observations],
+    groups: Sequence[Index],
+    folds: Sequence[Index],
+) -> tuple[Residuals, Residuals]:
+    """Return the residuals of every fold by its own two chains, before and after.
+
+    `groups` and `folds` hold the configuration and the fold of every pair (N,), set by set.
+    """
+    pieces: tuple[list[Residuals], list[Residuals]] = ([], [])
+    for k, pair in enumerate(chains):
+        for each, numbers in zip(sets, folds, strict=True):
+            out = each.select(np.flatnonzero(numbers == k))
+            for side, chain in zip(pieces, pair, strict=True):
+                side.append(residuals(chain, out))
+    index = np.argsort(np.argsort(np.concatenate(folds), kind='stable'))
+    before, after = (joined(side, np.concatenate(groups), index) for side in pieces)
+    return before, after
+
+
+def _fold_count(problem: Problem, names: Sequence[str], count: int, rows: int) -> int:
+    """Return the number of folds; 0 if all configurations are needed for the fit.
+
+    The other folds must determine the fit, with some equations to spare. If they do so only with
+    priors, one configuration is left out at a time.
+    """
+    known = dict(problem.model.effects)
+    names = [name for name in names if name not in known]  # effects have priors
+    folds = min(problem.folds, count)
+    if folds > 1 and rows * (folds - 1) // folds >= len(names) + TELLING:
+        return folds
+    folds = count
+    unknown = set(names) - problem.informed
+    if len(unknown) == len(names) or rows * (folds - 1) // folds < len(unknown) + TELLING:
+        return 0
+    return folds
