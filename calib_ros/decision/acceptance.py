@@ -12,9 +12,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy import special
 
-from calib_ros.decision.comparison import COUNTS, Comparison, log_gain, mean_squares
+from calib_ros.decision.improvement import gain_refusals, harm_refusals
 from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
@@ -23,16 +22,11 @@ from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import (
     ALIKE,
-    CERTAIN,
-    CLEARLY,
-    CONFIDENT,
-    LARGEST_SCALE,
     MOST_OUTLIERS,
 )
 from calib_ros.estimation.problem import Problem
-from calib_ros.kinematics.se3 import Flags
 from calib_ros.settings import EXCEPTION
-from calib_ros.shown import rounded, some
+from calib_ros.shown import some
 
 
 def refusals(
@@ -60,13 +54,13 @@ def refusals(
             failed.append(result.step.reason)
         text = f'{100.0 * share:.0f} % of the judged poses are outliers'
         return (*failed, Reason(Rule.OUTLIERS, text))
-    gained = tuple(_gain_refusals(problem, result, validation, sized, scaled))
+    gained = tuple(gain_refusals(problem, result, validation, sized, scaled))
     before, after = validation.figures
     helps = after.rms_mm < before.rms_mm or all(each.rule is not Rule.GAIN for each in gained)
     if after.rms_mm > max(1e3 * problem.largest_error, before.rms_mm / ALIKE):
         # of a fit that explains nothing the parameters tell nothing
         failed = [each for each in failed if each.rule is not Rule.COMMON_SENSE]
-    return (*failed, *gained, *_harm_refusals(validation, may_be_rounding, helps))
+    return (*failed, *gained, *harm_refusals(validation, may_be_rounding, helps))
 
 
 def _fit_refusals(
@@ -121,158 +115,6 @@ def _idle_joints(problem: Problem) -> str:
     least = np.linalg.norm((turns - turns.mean(axis=0)).reshape(-1, 3), -2) / len(turns) ** 0.5
     level = 'the tool points one way in all poses (tilt it): '
     return found or (level if least < DEGENERATE else '')
-
-
-def _gain(
-    validation: Comparison, part: str, which: Flags, *confidence: float
-) -> tuple[float, float]:
-    """Return the `log_gain` in `position` or `orientation` of pairs by a mask (N,)."""
-    before, after = (getattr(each, part)[which] for each in (validation.before, validation.after))
-    return log_gain(before, after, validation.after.configurations[which], *confidence)
-
-
-def _gain_refusals(
-    problem: Problem, result: Identification, validation: Comparison, sized: bool, scaled: float
-) -> Iterator[Reason]:
-    before, after = validation.figures
-    judged = validation.deciding
-    gain, limit = _gain(validation, 'position', judged)
-    largest = 1e3 * problem.largest_error
-    if after.rms_mm > largest and (before.rms_mm > largest or gain > limit):
-        yield Reason(
-            Rule.LARGEST_ERROR,
-            f'RMS {rounded(after.rms_mm)} mm remains on held-out poses, more than '
-            f'{largest:g} mm (largest_error)',
-        )
-    if not gain > limit:
-        text = f'RMS {before.rms_mm:.3f} mm before, {after.rms_mm:.3f} mm after'
-        if gain > 0.0:
-            count = len(np.unique(validation.after.configurations[judged]))
-            kind = 'places' if all(each.socket for each in problem.sets) else 'poses'
-            chance = before.rms_mm * np.exp(-limit)
-            text += f'; with {count} {kind}, chance alone can lower it to {chance:.3f} mm'
-        yield Reason(Rule.GAIN, f'no gain on held-out poses beyond chance ({text})')
-    elif result.chance is not None and result.chance > 1.0 - CONFIDENT:
-        yield Reason(
-            Rule.DRIFT,
-            'a slow drift may explain the gain: shifted to the wrong poses, errors can be '
-            f'corrected just as well in {100.0 * result.chance:.0f} % of cases '
-            f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
-        )
-    elif scaled and not result.surprise:
-        printed = all(each.pixels is not None for each in problem.sets)
-        yield Reason(Rule.SCALE, out_of_scale(scaled, printed))
-    elif result.region is not None and result.surprise and before.rms_mm < ALIKE * after.rms_mm:
-        yield Reason(
-            Rule.REGION,
-            f'{result.contradiction}, and the correction lowers their error by less than a third',
-        )
-    elif result.region is None:
-        text = 'the correction is not larger than its own uncertainty, even at the poses measured'
-        text += f': {result.contradiction}' if result.surprise else ''
-        if not sized:
-            text += (
-                '; measure something that fixes the size and shape of the arm: positions, or two '
-                'sockets a known distance apart'
-            )
-        used = dict.fromkeys(key for each in problem.sets for key in (each.base, each.tool))
-        if held := [key for key in used if problem.model.frame(key).fixed]:
-            text += (
-                f'; if the {" or ".join(held)} held by the chain file may be off, remove fixed: '
-                'true there'
-            )
-        yield Reason(Rule.REGION, text)
-
-
-def out_of_scale(scale: float, printed: bool = False, checked: bool = False) -> str:
-    """Return that a scale of the device, given minus one, may make the calibrated arm worse.
-
-    Of a `printed` board it is that of its stated size.
-    """
-    way, size = ('grow', 'large') if scale > 0.0 else ('shrink', 'small')
-    grown = f'all lengths of the arm {way} alike, by {percent(abs(scale))} %'
-    if checked:
-        return (
-            f'{grown}, more than sigma_scale allows: measure a known length, or the printed '
-            'board, again'
-        )
-    text = f'{grown}, as if the measuring device were out of scale; then'
-    check = 'If a known length shows that its'
-    if printed:
-        check = 'Measure the print; if its'
-        text = f'{grown}, as if the board were stated too {size}; then'
-        if abs(scale) < LARGEST_SCALE:  # as arms do
-            text = 'the size of the board is not known well enough:'
-    return (
-        f'{text} the correction may make the arm worse. {check} scale is right, set sigma_scale '
-        '(--sigma-scale) to its accuracy'
-    )
-
-
-def percent(share: float) -> str:
-    """Return a small share in percent, with two digits."""
-    return np.format_float_positional(100.0 * share, 2, fractional=False, trim='-')
-
-
-def _harm_refusals(validation: Comparison, may_be_rounding: bool, helps: bool) -> Iterator[Reason]:
-    if helps and validation.outliers:
-        first, second = validation.figures_of_all
-        gain, limit = _gain(validation, 'position', validation.counting, CERTAIN)
-        limit = max(limit, _loss_by_chance(validation), COUNTS)
-        caused = second.rms_mm > first.rms_mm and _causes_outliers(validation)
-        if second.mean_mm > first.mean_mm or gain < -limit or caused:
-            yield Reason(
-                Rule.GAIN_WITH_OUTLIERS,
-                f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
-                f'mm before, {second.rms_mm:.3f} mm after; mean {first.mean_mm:.3f} and '
-                f'{second.mean_mm:.3f} mm)',
-            )
-    if may_be_rounding:
-        text = 'the improvement may only come from rounded joint values that repeat in many poses'
-        yield Reason(Rule.ROUNDING, text)
-    before, after = validation.figures
-    if after.rms_mrad is not None:
-        gain, limit = _gain(validation, 'orientation', validation.deciding)
-        if gain < -max(limit, COUNTS):
-            yield Reason(
-                Rule.ORIENTATION,
-                f'the orientation got worse on held-out poses (RMS {before.rms_mrad:.3f} mrad '
-                f'before, {after.rms_mrad:.3f} mrad after)',
-            )
-
-
-def _loss_by_chance(validation: Comparison) -> float:
-    """Return the log of RMS after / RMS before, outliers included, that chance could cause.
-
-    A correction makes a much larger gross error bigger or smaller at random. Student's t of the
-    differences of squares accounts for that, even with a single outlier.
-    """
-    which, groups = validation.counting, validation.after.configurations
-    before, after = (each.position[which] for each in (validation.before, validation.after))
-    means = mean_squares(before, after, groups[which])
-    count = means.shape[1]
-    if count < 2:
-        return np.inf
-    error = np.diff(means, axis=0).std(ddof=1) / np.sqrt(count)
-    likely = special.stdtrit(count - 1, CERTAIN) * error
-    return 0.5 * float(likely / max(means[0].mean(), 1e-300))
-
-
-def _causes_outliers(validation: Comparison) -> bool:
-    """Tell whether the correction itself causes outliers, so that these are no gross errors.
-
-    Gross errors e do not know the correction c: 2 e c, by which their squares before exceed those
-    after (beside c^2), has either sign and a variance of 4/3 |e|^2 |c|^2. Errors clearly larger
-    than the correction are not caused by it.
-    """
-    which = validation.counting & ~validation.judged
-    before, after = (each.position[which] for each in (validation.before, validation.after))
-    change = before - after
-    lengths, errors = (np.linalg.norm(each, axis=1) for each in (change, after))
-    near = errors < CLEARLY * lengths
-    along = (after * change)[near].sum()
-    chance = special.ndtri(CERTAIN) * np.linalg.norm((errors * lengths)[near]) / np.sqrt(3.0)
-    return bool(along < -chance)
 
 
 def oddities(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:

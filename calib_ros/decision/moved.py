@@ -5,12 +5,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import chain
 
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.shown import are_lines, moment, rows_in_words
 
 ZERO = 'zero'  # of the distances of a device
@@ -137,47 +135,3 @@ def thing_of(kind: str, seen: Observations) -> str:
     on_flange, other = (device, target) if seen.inverse or seen.on_flange else (target, device)
     *first, last = on_flange if kind == 'tool' else [*other, "the robot's foot"]
     return f'{", ".join(first)} or {last}' if first else last
-
-
-@dataclass(frozen=True, eq=False)
-class Moving:
-    """Columns switched on together: a frame of some sets, zeros of joints, or the load."""
-
-    what: str
-    kind: str
-    names: tuple[str, ...]
-    sets: tuple[int, ...]
-    held: bool = False
-
-
-def of_the_arm(problem: Problem) -> list[Moving]:
-    """Return the load, with the torque of a weight at the last joint, and the zeros of all."""
-    joints, everywhere = problem.chain.joints, tuple(range(len(problem.sets)))
-    last = joints[-1].name
-    load = tuple(Parameter(j.name, f'gravity_{last}') for j in joints if j.type == 'revolute')
-    zeros = tuple(joint.driven for joint in joints)
-    loads = [Moving('the load', 'load', load, everywhere)] if load else []
-    return [*loads, Moving('all joints', 'joints', zeros, everywhere)]
-
-
-def groups_of(problem: Problem) -> list[Moving]:
-    """Return what may move: frames, zeros of joints, then of distances, one and all together."""
-    found = []
-    for kind in ('base', 'tool'):
-        for frame in dict.fromkeys(getattr(each, kind) for each in problem.sets):
-            sets = [k for k, each in enumerate(problem.sets) if getattr(each, kind) == frame]
-            seen = problem.sets[sets[0]]
-            socket = kind == 'base' and (seen.socket or seen.seen)  # the ball turns in it
-            names = parameters_of(frame)[: 3 if socket else 6]
-            found.append(Moving(frame, kind, names, tuple(sets), problem.model.frame(frame).fixed))
-    joints, everywhere = problem.chain.joints, tuple(range(len(problem.sets)))
-    found += [Moving(each.name, 'joint', (each.driven,), everywhere) for each in joints]
-    wires: dict[str, list[int]] = {}
-    for k, each in enumerate(problem.sets):
-        if each.distances is not None and not each.plane:
-            wires.setdefault(each.base, []).append(k)
-    found += [Moving(w, ZERO, (Parameter(w, ZERO),), tuple(sets)) for w, sets in wires.items()]
-    if len(wires) > 1:
-        names, sets = tuple(Parameter(w, ZERO) for w in wires), sorted(chain(*wires.values()))
-        found.append(Moving(', '.join(wires), ZERO, names, tuple(sets)))
-    return found

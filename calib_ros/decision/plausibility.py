@@ -16,7 +16,6 @@ from dataclasses import replace
 import numpy as np
 from scipy import special
 
-from calib_ros.decision.acceptance import out_of_scale
 from calib_ros.decision.delays import uneven
 from calib_ros.decision.lost_rows import computed_rows
 from calib_ros.decision.misfits import explained_share, loose_target
@@ -24,6 +23,7 @@ from calib_ros.decision.printed_board import stretched
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.risk import SHELL
+from calib_ros.decision.scale import out_of_scale
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.errors import CalibrationError, InputError
 from calib_ros.estimation.configurations import count_distinct

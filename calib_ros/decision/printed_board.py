@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from calib_ros.decision.acceptance import percent
 from calib_ros.decision.result import Identification
+from calib_ros.decision.scale import percent
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import LARGEST_SCALE, SURE
 from calib_ros.estimation.observations import Observations

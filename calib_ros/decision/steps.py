@@ -23,18 +23,8 @@ import numpy as np
 
 from calib_ros.decision.drift import slow_cosines
 from calib_ros.decision.imitations import LEAST, Imitation
-from calib_ros.decision.moved import (
-    FROM_THERE,
-    IN_THE_CELL,
-    ZERO,
-    ZEROS,
-    Moving,
-    Step,
-    groups_of,
-    of_the_arm,
-    place_of,
-    thing_of,
-)
+from calib_ros.decision.movable import Moving, groups_of, of_the_arm
+from calib_ros.decision.moved import FROM_THERE, IN_THE_CELL, ZERO, ZEROS, Step, place_of, thing_of
 from calib_ros.decision.trials import largest_of
 from calib_ros.estimation.configurations import stops
 from calib_ros.estimation.fitted import Fitted

@@ -26,19 +26,12 @@ from typing import TypeAlias
 import numpy as np
 from scipy import special
 
-from calib_ros.estimation.considered import (
-    NuisanceProducts,
-    Nuisances,
-    held_frames,
-    lengths_of,
-    lenses,
-    nuisance_products,
-    travels,
-)
+from calib_ros.estimation.considered import held_frames, lengths_of, lenses, travels
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import about_nominal
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.levels import CONFIDENT, OUT_OF_SCALE, PRINTED, SCALE, UNUSUAL
+from calib_ros.estimation.nuisances import NuisanceProducts, Nuisances, nuisance_products
 from calib_ros.estimation.sizes import TYPICAL, Evidence, mixed, solved
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain

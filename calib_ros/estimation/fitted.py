@@ -12,10 +12,10 @@ import numpy as np
 from scipy import special
 
 from calib_ros.estimation import identifiability
-from calib_ros.estimation.considered import Nuisances, nuisance_products
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import CONFIDENT, KNOWN
 from calib_ros.estimation.noise import Noise
+from calib_ros.estimation.nuisances import Nuisances, nuisance_products
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import Robust
 from calib_ros.kinematics.chain import Chain

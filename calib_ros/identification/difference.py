@@ -10,7 +10,7 @@ quadratic form of d; its limit is the quantile for d ~ N(d, C).
 
 Wobble that the models lack is the same in both, so C has the covariance of the difference of its
 effects on the parameters (`unmodelled.py`): nothing for the same poses. The usual drift (`age.py`)
-is no change either. Smooth errors of a moved device (`considered.py`) give differences at other
+is no change either. Smooth errors of a moved device (`distortion.py`) give differences at other
 poses; a difference that is significant only without them is reported as such.
 """
 

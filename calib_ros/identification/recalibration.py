@@ -8,7 +8,7 @@ arm determine the change dx by A = J^T W J and b = J^T W r, with the prior dx ~ 
 larger change must have a cause that affects few parameters (`changes.py`). These become free (of
 both causes if indistinguishable), and the estimate is the mean of dx given A and b, relinearised
 until it converges. From there the cause of a large change is searched again. Smooth device errors
-(`considered.py`), then and now, are no change of the arm.
+(`nuisances.py`), then and now, are no change of the arm.
 The result is used if the arm is then known about as well as before, or far better than it changed:
 few or similar poses let one cause imitate another.
 """
@@ -31,10 +31,10 @@ from calib_ros.decision.cross_validation import fold_residuals
 from calib_ros.decision.residuals import residuals
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import count_distinct
-from calib_ros.estimation.considered import Nuisances, nuisance_products
 from calib_ros.estimation.gain import about_nominal
 from calib_ros.estimation.leastsquares import System, products_of
 from calib_ros.estimation.levels import SCALE, SEVERAL, TRIED, chance_of
+from calib_ros.estimation.nuisances import Nuisances, nuisance_products
 from calib_ros.estimation.observations import SOME_POSES, Observations, frames_of_sets, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER

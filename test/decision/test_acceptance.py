@@ -12,7 +12,8 @@ from scipy import stats
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision import acceptance
-from calib_ros.decision.acceptance import _loss_by_chance, oddities, refusals
+from calib_ros.decision.acceptance import oddities, refusals
+from calib_ros.decision.improvement import _loss_by_chance
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.levels import CERTAIN

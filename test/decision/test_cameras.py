@@ -11,9 +11,9 @@ from fits import arm
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Camera, before_camera, photograph
 from calib_ros.decision import plausibility
-from calib_ros.decision.acceptance import out_of_scale
 from calib_ros.decision.mistakes import diagnose
 from calib_ros.decision.reasons import Rule
+from calib_ros.decision.scale import out_of_scale
 from calib_ros.kinematics.chain import Frame
 
 UR = load_chain('ur10e')

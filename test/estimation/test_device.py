@@ -9,8 +9,9 @@ import pytest
 from measured import bent
 
 from calib_ros import Observations, Problem, identify, load_chain
-from calib_ros.estimation.considered import Nuisances, bends, nuisance_products
+from calib_ros.estimation.distortion import bends
 from calib_ros.estimation.leastsquares import System
+from calib_ros.estimation.nuisances import Nuisances, nuisance_products
 from calib_ros.estimation.samples import Samples
 
 ARM = load_chain('ur10')

@@ -15,8 +15,8 @@ from calib_ros import Chain, Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.estimation.considered import Nuisances, nuisance_products
 from calib_ros.estimation.identifiability import structurally_independent
+from calib_ros.estimation.nuisances import Nuisances, nuisance_products
 from calib_ros.estimation.start import start_frames
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame, Joint

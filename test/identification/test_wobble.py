@@ -12,7 +12,6 @@ from calib_ros import Calibration, Problem, difference, identify, load_chain, re
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError
-from calib_ros.estimation.considered import Nuisances, nuisance_products
 from calib_ros.estimation.joint_errors import (
     NOTHING,
     Unmodelled,
@@ -20,6 +19,7 @@ from calib_ros.estimation.joint_errors import (
     turns_and_tilts,
     wobble_columns,
 )
+from calib_ros.estimation.nuisances import Nuisances, nuisance_products
 from calib_ros.identification.calibration import parse_calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain

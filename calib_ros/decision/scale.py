@@ -1,0 +1,41 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A device out of scale, in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib_ros.estimation.levels import (
+    LARGEST_SCALE,
+)
+
+
+def out_of_scale(scale: float, printed: bool = False, checked: bool = False) -> str:
+    """Return that a scale of the device, given minus one, may make the calibrated arm worse.
+
+    Of a `printed` board it is that of its stated size.
+    """
+    way, size = ('grow', 'large') if scale > 0.0 else ('shrink', 'small')
+    grown = f'all lengths of the arm {way} alike, by {percent(abs(scale))} %'
+    if checked:
+        return (
+            f'{grown}, more than sigma_scale allows: measure a known length, or the printed '
+            'board, again'
+        )
+    text = f'{grown}, as if the measuring device were out of scale; then'
+    check = 'If a known length shows that its'
+    if printed:
+        check = 'Measure the print; if its'
+        text = f'{grown}, as if the board were stated too {size}; then'
+        if abs(scale) < LARGEST_SCALE:  # as arms do
+            text = 'the size of the board is not known well enough:'
+    return (
+        f'{text} the correction may make the arm worse. {check} scale is right, set sigma_scale '
+        '(--sigma-scale) to its accuracy'
+    )
+
+
+def percent(share: float) -> str:
+    """Return a small share in percent, with two digits."""
+    return np.format_float_positional(100.0 * share, 2, fractional=False, trim='-')
