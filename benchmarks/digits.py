@@ -27,8 +27,9 @@ from scipy import linalg
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.estimation.identifiability import independent
-from calib_ros.estimation.leastsquares import System, stacked, triangular_factor
+from calib_ros.estimation.normal import triangular_factor
 from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.system import System, stacked
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 

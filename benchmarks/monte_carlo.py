@@ -27,8 +27,8 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.estimation import identifiability
-from calib_ros.estimation.leastsquares import triangular_factor
+from calib_ros.estimation import uncertainty
+from calib_ros.estimation.normal import triangular_factor
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.difference import difference
@@ -59,9 +59,7 @@ def one_run(nominal, seed, oriented, poses, told=1.0):
         sigma_orientation=told * SIGMA_ORIENTATION,
     )
     result = identify(problem)
-    bound = identifiability.covariance(
-        triangular_factor(true, result.names, problem.system([seen]))
-    )
+    bound = uncertainty.covariance(triangular_factor(true, result.names, problem.system([seen])))
     deviation, hits = off(result, true)
     unseen = nominal.random_joints(50, rng)
     error = (result.chain.forward(unseen) - true.forward(unseen))[:, :3, 3]

@@ -25,8 +25,8 @@ import numpy as np
 
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, photograph
 from calib_ros.errors import InputError
-from calib_ros.estimation import identifiability
-from calib_ros.estimation.leastsquares import normal_equations, triangular_factor
+from calib_ros.estimation import uncertainty
+from calib_ros.estimation.normal import normal_equations, triangular_factor
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
 from calib_ros.identification.identification import identify
@@ -90,9 +90,7 @@ def one_run(nominal, seed, on_flange, lens, images):
         known, seen, held_out=seen.select(np.arange(80)), sigma_pixel=SIGMA, priors=priors
     )
     result = identify(problem)
-    bound = identifiability.covariance(
-        triangular_factor(true, result.names, problem.system([seen]))
-    )
+    bound = uncertainty.covariance(triangular_factor(true, result.names, problem.system([seen])))
     deviation = np.array([result.chain.offset(name, true) for name in result.names])
     width = {p.name: p.half_width() for p in result.parameters if p.std is not None}
     hits = np.abs(deviation) <= [width[name] for name in result.names]

@@ -42,9 +42,10 @@ from calib_ros.apply.design import Design
 from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.changes import ChangeColumns
-from calib_ros.estimation.leastsquares import System, minimise
+from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.system import System
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibration import recalibrate

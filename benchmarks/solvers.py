@@ -93,8 +93,9 @@ def _start(given):
 
 def fit(given):
     """Only fit, from a start with frames: what the others below do, too."""
-    from calib_ros.estimation.leastsquares import System, minimise
+    from calib_ros.estimation.leastsquares import minimise
     from calib_ros.estimation.samples import Samples
+    from calib_ros.estimation.system import System
 
     start, names, sigmas = _start(given)
     system = System((Samples(_observations(given, given.samples), *sigmas),))
@@ -119,7 +120,8 @@ class Streamed:
 
 def streamed(given):
     """Only fit, and read the samples from the disk in each iteration."""
-    from calib_ros.estimation.leastsquares import System, minimise
+    from calib_ros.estimation.leastsquares import minimise
+    from calib_ros.estimation.system import System
 
     start, names, sigmas = _start(given)
     system = System((Streamed(given, sigmas),))
@@ -128,8 +130,9 @@ def streamed(given):
 
 def one_by_one(given):
     """Only fit, with the same code, one sample at a time."""
-    from calib_ros.estimation.leastsquares import System, minimise
+    from calib_ros.estimation.leastsquares import minimise
     from calib_ros.estimation.samples import Samples
+    from calib_ros.estimation.system import System
 
     start, names, sigmas = _start(given)
     joints, positions, rotations = given.samples

@@ -7,7 +7,7 @@ A pose with the rows A (m, P) of information (`design.py`) is judged by an m x m
     d       ln det(M + A^T A) - ln det M = ln det(I + A C A^T)          (O1, Borm and Menq 1991)
     task    tr V C - tr V (M + A^T A)^-1 = tr (I + A C A^T)^-1 A C V C A^T
             with V the mean of J^T J over the poses of a task: tr V C is the mean squared error
-    o2-o5   observability indices (`identifiability.observability`), from eigenvalues
+    o2-o5   observability indices (`observability.py`), from eigenvalues
 
 Poses are chosen one by one, best first, and then exchanged one by one while that helps (Fedorov
 1972, Mitchell 1974). A trace over A^T A, quick for all candidates at once, bounds `d` and `task`
@@ -37,7 +37,8 @@ from calib_ros.apply.design import (
 )
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.configurations import STILL
-from calib_ros.estimation.identifiability import independent, indices_of
+from calib_ros.estimation.identifiability import independent
+from calib_ros.estimation.observability import indices_of
 from calib_ros.kinematics.inverse import check_limits
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 from calib_ros.progress import Notify, quiet

@@ -20,10 +20,7 @@ from calib_ros.decision.result import Identification
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.identifiability import DEGENERATE
-from calib_ros.estimation.levels import (
-    ALIKE,
-    MOST_OUTLIERS,
-)
+from calib_ros.estimation.levels import ALIKE, MOST_OUTLIERS
 from calib_ros.estimation.problem import Problem
 from calib_ros.settings import EXCEPTION
 from calib_ros.shown import some

@@ -37,7 +37,7 @@ import numpy as np
 from scipy import linalg, special
 
 from calib_ros.estimation.gain import inverse_root
-from calib_ros.estimation.identifiability import best_imitation
+from calib_ros.estimation.gauges import best_imitation
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SCALE, SEVERAL, chance_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.sizes import SPREAD

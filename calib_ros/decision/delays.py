@@ -18,10 +18,10 @@ import numpy as np
 from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.gain import gain_share
-from calib_ros.estimation.leastsquares import stacked
 from calib_ros.estimation.levels import TELLING
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.system import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray, norms

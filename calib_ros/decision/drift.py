@@ -22,10 +22,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from calib_ros.estimation.configurations import group_means
 from calib_ros.estimation.gain import inverse_root
-from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import SEVERAL
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.samples import gram, summed
+from calib_ros.estimation.system import System
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index, norms
 

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import special
 
-from calib_ros.estimation.evidence import size_group
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import about_nominal, inverse_root
 from calib_ros.estimation.levels import NEARER, SURE
+from calib_ros.estimation.posterior import size_group
 from calib_ros.estimation.sizes import TYPICAL, Evidence
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 

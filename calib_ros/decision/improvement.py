@@ -13,12 +13,7 @@ from calib_ros.decision.comparison import COUNTS, Comparison, log_gain, mean_squ
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.scale import out_of_scale
-from calib_ros.estimation.levels import (
-    ALIKE,
-    CERTAIN,
-    CLEARLY,
-    CONFIDENT,
-)
+from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, CONFIDENT
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags
 from calib_ros.shown import rounded

@@ -18,11 +18,11 @@ from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.gain import gain_share
-from calib_ros.estimation.leastsquares import stacked
+from calib_ros.estimation.gross_errors import SUSPICIOUS
 from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.problem import Learned, Problem
-from calib_ros.estimation.robust import SUSPICIOUS
+from calib_ros.estimation.system import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of

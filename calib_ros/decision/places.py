@@ -11,10 +11,12 @@ import numpy as np
 
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.residuals import joined, residuals
+from calib_ros.estimation.arbitrary import drawn
 from calib_ros.estimation.fitted import Fitted
-from calib_ros.estimation.identifiability import drawn, independent_in
-from calib_ros.estimation.leastsquares import System, minimise
+from calib_ros.estimation.identifiability import independent_in
+from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.system import System
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
 

@@ -28,11 +28,12 @@ from calib_ros.decision.steps import EXPLAINED
 from calib_ros.errors import CalibrationError, InputError
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.fitting import fit
+from calib_ros.estimation.gross_errors import SUSPICIOUS
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, NEARER, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS
+from calib_ros.estimation.robust import OUTLIER
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics import effects

@@ -12,9 +12,7 @@ import numpy as np
 
 from calib_ros.decision.matrices import damage_error, packed, parse_rows, rows_of, unpacked_matrix
 from calib_ros.errors import UnknownNameError
-from calib_ros.estimation.joint_errors import (
-    NOTHING,
-)
+from calib_ros.estimation.joint_errors import NOTHING
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter

@@ -16,11 +16,12 @@ from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason
 from calib_ros.decision.region import Region
-from calib_ros.estimation import identifiability
-from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.levels import CONFIDENT, KNOWN
 from calib_ros.estimation.noise import Noise
+from calib_ros.estimation.observability import correlated
+from calib_ros.estimation.posterior import Posterior
+from calib_ros.estimation.uncertainty import Uncertainty
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter
@@ -38,7 +39,7 @@ class Identification(Shown):
     parameters: tuple[ParameterRow, ...]
     names: tuple[str, ...]
     """Fitted parameters, (P,)."""
-    uncertainty: identifiability.Uncertainty
+    uncertainty: Uncertainty
     """Of the fitted parameters, for the noise found in the residuals."""
     fitted: Comparison
     """Residuals of the fitted pairs."""
@@ -158,7 +159,7 @@ class Identification(Shown):
     @as_annotated
     def correlated(self, threshold: NotNegative = 0.9) -> tuple[tuple[str, str, float], ...]:
         """Return pairs of parameters whose correlation exceeds a threshold, strongest first."""
-        return identifiability.correlated(self.covariance, self.names, threshold)
+        return correlated(self.covariance, self.names, threshold)
 
     def to_frame(self) -> Any:
         """Return the parameters as a pandas.DataFrame [m, rad]; `within_95` are half widths."""

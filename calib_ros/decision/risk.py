@@ -21,15 +21,11 @@ import numpy as np
 from scipy import special
 
 from calib_ros.decision.region import Region
-from calib_ros.estimation.evidence import MixtureTerm, Posterior
 from calib_ros.estimation.gain import inverse_root
-from calib_ros.estimation.joint_errors import (
-    axis_parameters,
-    turns_and_tilts,
-    wobble_columns,
-)
+from calib_ros.estimation.joint_errors import axis_parameters, turns_and_tilts, wobble_columns
 from calib_ros.estimation.levels import KNOWN
 from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.posterior import MixtureTerm, Posterior
 from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import parameters_of
@@ -37,8 +33,6 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 
 RISK = 0.02
 """Largest probability that the arm gets worse over the poses of a shell (benchmarks/harm.py)."""
-
-
 SHELL = SOME_POSES // 20  # random configurations per shell
 
 

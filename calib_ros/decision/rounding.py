@@ -16,9 +16,9 @@ import numpy as np
 
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import gain_of
-from calib_ros.estimation.leastsquares import row_samples, stacked
 from calib_ros.estimation.levels import CLEARLY, SURE, chance_of
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.system import row_samples, stacked
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray

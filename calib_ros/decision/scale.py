@@ -6,9 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib_ros.estimation.levels import (
-    LARGEST_SCALE,
-)
+from calib_ros.estimation.levels import LARGEST_SCALE
 
 
 def out_of_scale(scale: float, printed: bool = False, checked: bool = False) -> str:

@@ -12,13 +12,15 @@ import numpy as np
 
 from calib_ros.decision.undoing import Sets
 from calib_ros.estimation.identifiability import excited
-from calib_ros.estimation.leastsquares import System, factor_of, minimise
+from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.levels import CLEARLY, MOST_OUTLIERS
+from calib_ros.estimation.normal import factor_of
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.start import closed_forms, flange, movable
+from calib_ros.estimation.system import System
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens

@@ -14,10 +14,10 @@ from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.decision.cross_validation import cross_validate
 from calib_ros.decision.places import leave_one_place_out, places_of
 from calib_ros.estimation.configurations import count_distinct
-from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.levels import ALIKE, SURE
 from calib_ros.estimation.observations import Observations, numbered
+from calib_ros.estimation.posterior import Posterior
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER, distances_of
 from calib_ros.kinematics.chain import Chain

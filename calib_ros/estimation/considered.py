@@ -7,8 +7,8 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Sequence
 
-from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import LARGEST_SCALE, OUT_OF_SCALE, PRINTED, SCALE
+from calib_ros.estimation.system import System
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_PIXELS, Parameter, parameters_of

@@ -11,13 +11,13 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from calib_ros.estimation import identifiability
-from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import CONFIDENT, KNOWN
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.nuisances import Nuisances, nuisance_products
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import Robust
+from calib_ros.estimation.system import System
+from calib_ros.estimation.uncertainty import Uncertainty
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
@@ -77,7 +77,7 @@ class Fitted:
     robust: Robust
     factor: FloatArray
     noise: Noise
-    uncertainty: identifiability.Uncertainty
+    uncertainty: Uncertainty
     size: float
     held: tuple[tuple[str, ...], FloatArray] | None = None
 
@@ -105,9 +105,7 @@ class Fitted:
         return nuisance_products(self.chain, self.names, self.system, Nuisances()).plain
 
 
-def parameter_rows(
-    fitted: Fitted, uncertainty: identifiability.Uncertainty
-) -> tuple[ParameterRow, ...]:
+def parameter_rows(fitted: Fitted, uncertainty: Uncertainty) -> tuple[ParameterRow, ...]:
     """Return every parameter of a fitted chain, with its standard deviation if fitted."""
     problem, chain, names = fitted.problem, fitted.chain, fitted.names
     change = _value_jacobian(chain, names)

@@ -16,18 +16,23 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from calib_ros.errors import InputError, TooFewObservationsError
-from calib_ros.estimation import identifiability
 from calib_ros.estimation.evidence import Inference
 from calib_ros.estimation.fitted import Fitted, SimplerFit
-from calib_ros.estimation.leastsquares import System, factor_of, minimise, triangular_factor
+from calib_ros.estimation.gauges import identifiable_and_held
+from calib_ros.estimation.gross_errors import SUSPICIOUS, thorough_fit
+from calib_ros.estimation.identifiability import excited
+from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.noise import Noise, noise_of, squares_of
+from calib_ros.estimation.normal import factor_of, triangular_factor
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.pixels import in_view
 from calib_ros.estimation.problem import Learned, Problem
-from calib_ros.estimation.robust import SUSPICIOUS, reweighted, thorough_fit
+from calib_ros.estimation.robust import reweighted
 from calib_ros.estimation.sizes import LEAST_SIZE, SETTLED, SPREAD
 from calib_ros.estimation.start import start_frames
+from calib_ros.estimation.system import System
+from calib_ros.estimation.uncertainty import covariance
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 from calib_ros.shown import counted
@@ -41,9 +46,7 @@ FOLLOWED = 2.0
 def fit(problem: Problem, simpler: SimplerFit | None = None) -> Fitted:
     """Fit what the poses determine."""
     model, separations = problem.model, System((), None, (*problem.separations,)).separation_rows
-    structural, held = identifiability.identifiable_and_held(
-        model, problem.free, problem.sets, separations
-    )
+    structural, held = identifiable_and_held(model, problem.free, problem.sets, separations)
     _require_enough(problem, [name for name in structural if name not in problem.prior_sigmas])
     fitted = _fit_all(problem, structural, start_frames(problem), simpler)
     held = tuple(name for name in held if name not in fitted.names)  # unless a prior tells them
@@ -68,10 +71,10 @@ def _excited_names(
     wanted = [n for n in problem.free if n in structural or n in priors]
     few, every = problem.system([each.spread(SOME) for each in problem.sets]), problem.sets
     factor = factor_of(start, wanted, _seen(start, few))
-    names = identifiability.excited(factor, wanted)
+    names = excited(factor, wanted)
     if len(names) < len(wanted) and few.count < sum(map(len, every)):  # more may determine more
         system = _seen(start, problem.system(every))
-        names = identifiability.excited(triangular_factor(start, wanted, system), wanted)
+        names = excited(triangular_factor(start, wanted, system), wanted)
     return names, np.asarray(np.linalg.qr(factor[:, np.isin(wanted, names)], mode='r'))
 
 
@@ -214,7 +217,7 @@ def _guarded(
     prior.
     """
     known = problem.prior_sigmas
-    stds = np.sqrt(np.diag(identifiability.covariance(factor))).tolist()
+    stds = np.sqrt(np.diag(covariance(factor))).tolist()
     guards = {
         name: problem.common_sense(name)
         for name, std in zip(names, stds, strict=True)

@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from calib_ros.estimation import identifiability
-from calib_ros.estimation.identifiability import Uncertainty
-from calib_ros.estimation.leastsquares import Fit, System
+from calib_ros.estimation import uncertainty
+from calib_ros.estimation.gross_errors import SUSPICIOUS
+from calib_ros.estimation.leastsquares import Fit
 from calib_ros.estimation.levels import SURE
 from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import SUSPICIOUS
 from calib_ros.estimation.shared_errors import shared_errors
+from calib_ros.estimation.system import System
+from calib_ros.estimation.uncertainty import Uncertainty
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.values import SAME
@@ -79,7 +80,7 @@ def noise_of(
     orientation) has as many degrees of freedom as equations, minus its share of the parameters,
     trace(H^-1 H_part). Pairs of one configuration share the model error, and count for fewer.
     """
-    plain = identifiability.covariance(factor)
+    plain = uncertainty.covariance(factor)
     taken = np.array([float(np.sum(plain * part)) for part in fit.normal.parts])
     squares = squares_of(fit.chain, system)
     if not fit.normal.parts[1].any():  # whitened as a whole, or no orientation
@@ -115,7 +116,7 @@ def noise_of(
         return noise, Uncertainty(plain[np.newaxis], np.array([np.inf]))
 
     sources = [neighbours.middles.get(k, middle) for k, middle in enumerate(middles)]
-    parts = [identifiability.covariance(factor, middle) for middle in sources]
+    parts = [uncertainty.covariance(factor, middle) for middle in sources]
     by_priors = plain @ extra.T
     covariance = np.array([*parts, by_priors @ by_priors.T])
     if neighbours.middles:

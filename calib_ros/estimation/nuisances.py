@@ -20,9 +20,10 @@ from scipy import linalg
 
 from calib_ros.estimation.distortion import bends
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled, axis_parameters
-from calib_ros.estimation.leastsquares import System, products_of
+from calib_ros.estimation.normal import products_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.samples import gram
+from calib_ros.estimation.system import System
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 

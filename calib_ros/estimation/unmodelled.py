@@ -31,22 +31,23 @@ import numpy as np
 from scipy import special
 
 from calib_ros.estimation.configurations import configurations
-from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.gain import about_nominal
-from calib_ros.estimation.identifiability import covariance
+from calib_ros.estimation.gross_errors import SUSPICIOUS
 from calib_ros.estimation.joint_errors import (
     Unmodelled,
     axis_parameters,
     turns_and_tilts,
     wobble_columns,
 )
-from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SEVERAL
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.robust import SUSPICIOUS
+from calib_ros.estimation.posterior import Posterior
+from calib_ros.estimation.quadratic_forms import nonnegative
 from calib_ros.estimation.samples import gram
-from calib_ros.estimation.shared_errors import gathered, nonnegative
 from calib_ros.estimation.sizes import LEAST_SIZE, REFUTED, SHOWN, SPREAD, TYPICAL, solved
+from calib_ros.estimation.stops import gathered
+from calib_ros.estimation.system import System
+from calib_ros.estimation.uncertainty import covariance
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index
 from calib_ros.settings import EXCEPTION
 

@@ -27,11 +27,11 @@ from calib_ros.decision import changes
 from calib_ros.decision.another import is_another
 from calib_ros.decision.changes import ChangeColumns, Explanation, Information
 from calib_ros.errors import InputError
-from calib_ros.estimation.evidence import size_group
 from calib_ros.estimation.gain import inverse_root
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.levels import CONFIDENT, SEVERAL, chance_of
 from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.posterior import size_group
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.start import fit_to_arm
 from calib_ros.identification.age import drift_of, years_between

@@ -29,15 +29,19 @@ from calib_ros.decision.rounding import may_be_rounding, rounded_joints, roundin
 from calib_ros.decision.steps import find_step
 from calib_ros.decision.validation import held_out_excess, validate
 from calib_ros.errors import InputError
-from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.considered import considered
-from calib_ros.estimation.evidence import Inference, Posterior
+from calib_ros.estimation.evidence import Inference
 from calib_ros.estimation.fitted import Fitted, ParameterRow, SimplerFit, parameter_rows
 from calib_ros.estimation.fitting import SOME, fit
-from calib_ros.estimation.leastsquares import System, minimise, normal_equations
+from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.levels import SCALE, SEVERAL
+from calib_ros.estimation.normal import normal_equations
+from calib_ros.estimation.observability import observability, trades
+from calib_ros.estimation.posterior import Posterior
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.system import System
+from calib_ros.estimation.uncertainty import Uncertainty
 from calib_ros.estimation.unmodelled import unmodelled_errors
 from calib_ros.identification.linear_model import COMPARED, HARMONICS, LinearModel
 from calib_ros.kinematics import effects
@@ -111,7 +115,7 @@ def _identified(
         distances=robust.distances,
         outliers=outliers_of(fitted),
         gauges=_gauges(fitted),
-        observability=identifiability.observability(fitted.factor, robust.system.count),
+        observability=observability(fitted.factor, robust.system.count),
         priors=_priors(problem),
         world_frame=problem.world_frame,
         converged=before.converged and robust.fit.converged and robust.settled,
@@ -134,7 +138,7 @@ def _identified(
     return plausibility.add_remarks(problem, named, another=named is result)
 
 
-def _inferred(inference: Inference) -> tuple[Posterior, identifiability.Uncertainty]:
+def _inferred(inference: Inference) -> tuple[Posterior, Uncertainty]:
     """Return the posterior with what no parameter explains, and the uncertainty of the fit."""
     fitted, posterior = inference.fitted, inference.judging()
     unmodelled, moved = unmodelled_errors(posterior, fitted.factor, fitted.system)
@@ -214,7 +218,7 @@ def _gauges(fitted: Fitted) -> dict[str, list[str]]:
         return {}
     few = problem.system([each.spread(SOME) for each in problem.sets])
     normal = normal_equations(fitted.chain, free, System(few.sets))
-    return identifiability.trades(normal.matrix, free, names)
+    return trades(normal.matrix, free, names)
 
 
 @as_annotated

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.estimation.gross_errors import MANY
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.robust import MANY
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import ROW_KINDS
 from calib_ros.kinematics.se3 import FloatArray, Index

@@ -19,15 +19,18 @@ import numpy as np
 from calib_ros.errors import CalibrationError
 from calib_ros.estimation.configurations import configurations, count_distinct
 from calib_ros.estimation.fitting import SOME
+from calib_ros.estimation.gross_errors import chance_of_outliers, thorough_fit
 from calib_ros.estimation.identifiability import structurally_independent
-from calib_ros.estimation.leastsquares import STEP_TOLERANCE, Prior, normal_equations
+from calib_ros.estimation.leastsquares import STEP_TOLERANCE
 from calib_ros.estimation.levels import SURE
+from calib_ros.estimation.normal import normal_equations
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTER, chance_of_outliers, robust_fit, thorough_fit
+from calib_ros.estimation.robust import OUTER, robust_fit
 from calib_ros.estimation.samples import residual_arrays
 from calib_ros.estimation.sizes import solved
 from calib_ros.estimation.start import start_frames
+from calib_ros.estimation.system import Prior
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import DELAY, DH_ANGLES, IN_A_FRAME, Parameter

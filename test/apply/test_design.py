@@ -21,7 +21,7 @@ from calib_ros.apply.design import (
 )
 from calib_ros.apply.planning import Choice
 from calib_ros.errors import InputError
-from calib_ros.estimation.identifiability import observability
+from calib_ros.estimation.observability import observability
 from calib_ros.kinematics.jacobian import ErrorModel
 
 

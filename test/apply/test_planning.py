@@ -16,7 +16,7 @@ from calib_ros.apply.candidates import visit_order
 from calib_ros.apply.design import Candidates, Design, accuracy
 from calib_ros.apply.planning import Choice
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.estimation.identifiability import observability
+from calib_ros.estimation.observability import observability
 from calib_ros.kinematics.chain import Joint
 
 POSITIONER = Chain(

@@ -15,9 +15,10 @@ from calib_ros.apply.simulation import measure
 from calib_ros.decision import drift as drift_module
 from calib_ros.decision.drift import Shifts, chance, chance_of_gain
 from calib_ros.decision.reasons import Rule
-from calib_ros.estimation.leastsquares import Prior, minimise
+from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import start_frames
+from calib_ros.estimation.system import Prior
 from calib_ros.identification.identification import identify, identify_model
 from calib_ros.report.documents import as_document
 from calib_ros.report.words import chance_in_words

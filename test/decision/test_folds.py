@@ -13,9 +13,9 @@ from calib_ros.decision import rounding
 from calib_ros.decision.rounding import rounded_joints, rounding_errors
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.leastsquares import row_samples, stacked
 from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.system import row_samples, stacked
 from calib_ros.identification import identification
 from calib_ros.identification.identification import identify, identify_model
 

@@ -13,7 +13,7 @@ from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.misfits import explained_share
 from calib_ros.decision.plausibility import _motion
 from calib_ros.decision.reasons import Rule
-from calib_ros.estimation.leastsquares import stacked
+from calib_ros.estimation.system import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Joint
 from calib_ros.kinematics.se3 import exp_rotation

@@ -10,9 +10,9 @@ from measured import bent
 
 from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.estimation.distortion import bends
-from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.nuisances import Nuisances, nuisance_products
 from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.system import System
 
 ARM = load_chain('ur10')
 SIGMA = 2e-4

@@ -11,10 +11,11 @@ from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.apply.simulation import measure
 from calib_ros.estimation import evidence
 from calib_ros.estimation.considered import considered
-from calib_ros.estimation.evidence import Inference, Posterior, _device, size_group
+from calib_ros.estimation.evidence import Inference, _device
 from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.leastsquares import System
+from calib_ros.estimation.posterior import Posterior, size_group
 from calib_ros.estimation.sizes import SPREAD, TYPICAL, Evidence
+from calib_ros.estimation.system import System
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.parameter import Parameter
 

@@ -14,11 +14,11 @@ from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation import fitting
 from calib_ros.estimation.fitted import SimplerFit, _value_jacobian, parameter_rows
 from calib_ros.estimation.fitting import SOME
-from calib_ros.estimation.identifiability import Uncertainty
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.sizes import LEAST_SIZE
+from calib_ros.estimation.uncertainty import Uncertainty
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.effects import members
 

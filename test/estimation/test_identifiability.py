@@ -9,15 +9,11 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.estimation.identifiability import (
-    correlated,
-    covariance,
-    independent,
-    observability,
-    trades,
-)
+from calib_ros.estimation.identifiability import independent
+from calib_ros.estimation.observability import correlated, observability, trades
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.uncertainty import covariance
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame

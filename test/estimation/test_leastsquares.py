@@ -14,17 +14,11 @@ from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.residuals import residuals
 from calib_ros.estimation import leastsquares
 from calib_ros.estimation.identifiability import structurally_independent
-from calib_ros.estimation.leastsquares import (
-    Normal,
-    Prior,
-    System,
-    leave_fold_out,
-    minimise,
-    normal_equations,
-    triangular_factor,
-)
+from calib_ros.estimation.leastsquares import leave_fold_out, minimise
+from calib_ros.estimation.normal import Normal, normal_equations, triangular_factor
 from calib_ros.estimation.samples import BLOCK, Samples
 from calib_ros.estimation.start import start_frames
+from calib_ros.estimation.system import Prior, System
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS
 
 
@@ -130,7 +124,7 @@ def test_normal_equations_and_triangular_factor_agree_over_blocks():
 def dampings(monkeypatch, gains):
     """Return the dampings of steps, with costs lowered by these gains, in units foreseen."""
     start, names, system = still_joint('ur10e', 0)
-    real, solve = normal_equations(start, names[:1], system), leastsquares._solve
+    real, solve = normal_equations(start, names[:1], system), leastsquares.solved_step
     used, left, cost, foreseen = [], [*gains], 1e8, 0.0
     best = cost
 
@@ -151,7 +145,7 @@ def dampings(monkeypatch, gains):
         return step
 
     monkeypatch.setattr(leastsquares, 'normal_equations', equations)
-    monkeypatch.setattr(leastsquares, '_solve', solved)
+    monkeypatch.setattr(leastsquares, 'solved_step', solved)
     minimise(start, names[:1], system, iterations=len(gains))
     return np.array(used) / HALF_THE_DIGITS
 

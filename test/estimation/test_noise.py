@@ -12,12 +12,14 @@ from scipy import stats
 from calib_ros import Observations, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.estimation import noise as noise_module
-from calib_ros.estimation.leastsquares import Prior, System, minimise, stacked, triangular_factor
+from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.levels import chance_of
 from calib_ros.estimation.noise import Noise, noise_of
+from calib_ros.estimation.normal import triangular_factor
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.shared_errors import Shared
+from calib_ros.estimation.system import Prior, System, stacked
 from calib_ros.estimation.unmodelled import _variances
 
 NAMES = [*(name for name in UR10E.parameter_names if UR10E.owns_frame(name)), 'elbow_joint.theta']

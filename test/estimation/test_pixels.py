@@ -16,9 +16,10 @@ from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
 from calib_ros.decision.mistakes import diagnose
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.estimation.leastsquares import System, products_of, stacked
+from calib_ros.estimation.normal import products_of
 from calib_ros.estimation.pixels import PixelSamples, seen_residuals
 from calib_ros.estimation.resection import _from_homography, board_poses, resect
+from calib_ros.estimation.system import System, stacked
 from calib_ros.identification import identification
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.parameter import Parameter

@@ -11,11 +11,12 @@ from fits import NOISE, SIGMAS, UR10E, measured_arm, spoiled
 from scipy import special, stats
 
 from calib_ros.apply.simulation import measure
-from calib_ros.estimation import robust
-from calib_ros.estimation.leastsquares import System, minimise
+from calib_ros.estimation import gross_errors, robust
+from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import INNER, OUTER, distances_of, weights_of
 from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.system import System
 from calib_ros.kinematics import se3
 
 
@@ -92,9 +93,9 @@ def test_the_chance_of_leaving_so_many_out_is_that_of_the_f_test(out, share, mon
     normal = SimpleNamespace(cost=200.0 * share)
     second = SimpleNamespace(outliers=np.arange(30) < out, fit=SimpleNamespace(normal=normal))
     least = SimpleNamespace(normal=SimpleNamespace(cost=200.0))
-    monkeypatch.setattr(robust, 'minimise', lambda *_, **__: least)
+    monkeypatch.setattr(gross_errors, 'minimise', lambda *_, **__: least)
     names = ['a', 'b', 'c', 'd']
-    found = robust.chance_of_outliers(second, None, names, system, 90 - 3)
+    found = gross_errors.chance_of_outliers(second, None, names, system, 90 - 3)
     spare, shifts = 0.5 * (90 - 3 - 3 * out), 0.5 * 3 * out
     if not out or share > 0.99:  # all of them, or more than left out by chance
         assert found == (1.0 if out else 0.0)
@@ -105,7 +106,7 @@ def test_the_chance_of_leaving_so_many_out_is_that_of_the_f_test(out, share, mon
     tail = (share / mean) ** spare * ((1.0 - share) / (1.0 - mean)) ** shifts
     assert found == pytest.approx(min(special.comb(30, out) * tail, 1.0), rel=1e-9, abs=0.0)
     second.fit.normal.cost = 0.0  # too small for a float
-    assert 0.0 <= robust.chance_of_outliers(second, None, names, system, 90 - 3) < 1e-200
+    assert 0.0 <= gross_errors.chance_of_outliers(second, None, names, system, 90 - 3) < 1e-200
 
 
 @pytest.mark.parametrize('loss', ['redescending', 'huber'])

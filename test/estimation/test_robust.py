@@ -253,7 +253,7 @@ def test_an_even_spread_of_many_samples_tells_the_gross_errors_of_all(unsearched
     rng, _, seen, unseen = cell(4, count=300)
     seen, wrong = spoiled(seen, rng, 0.2, shift=(5e-3, 50e-3))
     whole = fit(seen)
-    monkeypatch.setattr('calib_ros.estimation.robust.MANY', 100)
+    monkeypatch.setattr('calib_ros.estimation.gross_errors.MANY', 100)
     some = fit(seen)
     assert {each.sample for each in some.outliers} == {each.sample for each in whole.outliers}
     assert wrong <= {each.sample for each in some.outliers}

@@ -11,9 +11,12 @@ from scipy.spatial.distance import cdist
 from scipy.stats import norm
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.estimation import samples as samples_module, shared_errors
-from calib_ros.estimation.leastsquares import System, minimise
+from calib_ros.estimation import quadratic_forms, samples as samples_module, shared_errors
+from calib_ros.estimation.fading import faded_in_succession, faded_near
+from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.stops import ELSEWHERE, Stops, gather
+from calib_ros.estimation.system import System
 from calib_ros.identification.identification import identify
 from calib_ros.report.documents import as_document
 from calib_ros.report.words import neighbours_in_words
@@ -95,7 +98,7 @@ def test_errors_in_succession_have_the_kernel_of_their_distance_in_time(monkeypa
     apart = np.abs(np.subtract.outer(number, number))
     kernel = sum(size * np.exp(-apart / length) for length, size in kernels)
     rows = samples.rows_of(UR10E, names).T[..., :-1]
-    found = shared_errors._successive(UR10E, names, system, {0: kernels, 1: kernels})
+    found = faded_in_succession(UR10E, names, system, {0: kernels, 1: kernels})
     for part, own in enumerate((rows[:, :3], rows[:, 3:])):
         expected = np.einsum('ncp,nm,mcr->pr', own, kernel, own, optimize=True)
         np.testing.assert_allclose(found[part], expected, rtol=1e-9, atol=1e-9 * expected.max())
@@ -120,7 +123,7 @@ def drawn(rng, count=20, width=4):
     parts = [rng.normal(size=(width + 1, 3, count)) for _ in range(2)]
     parts[1][:, :, ::3] = 0.0
     place = rng.normal(size=(count, 2))
-    return shared_errors.Stops(parts, np.ones(count), place, np.arange(count, dtype=float), place)
+    return Stops(parts, np.ones(count), place, np.arange(count, dtype=float), place)
 
 
 def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
@@ -128,7 +131,7 @@ def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
     count, width = 20, 4
     units = drawn(np.random.default_rng(0), count, width)
     units.place[1::2] = units.place[::2]  # each visited twice
-    parts, forms = units.parts, shared_errors._Forms(units, np.zeros((0, width)))
+    parts, forms = units.parts, quadratic_forms.QuadraticForms(units, np.zeros((0, width)))
     rows = np.concatenate([part.reshape(width + 1, -1).T for part in parts])
     basis = np.linalg.qr(rows[:, :-1])[0]
     measured = np.concatenate([part.any(axis=0).ravel() for part in parts])
@@ -168,8 +171,8 @@ def test_where_no_more_was_measured_than_fitted_nothing_is_shared():
     for _ in range(20):
         place, time = rng.normal(size=(count, 2)), np.arange(count, dtype=float)
         parts = [rng.normal(size=(2 * count, 2, count)), np.zeros((2 * count, 3, count))]
-        units = shared_errors.Stops(parts, np.ones(count), place, time, place)
-        forms = shared_errors._Forms(units, np.zeros((0, 2 * count - 1)))
+        units = Stops(parts, np.ones(count), place, time, place)
+        forms = quadratic_forms.QuadraticForms(units, np.zeros((0, 2 * count - 1)))
         assert forms.test(0, units.links('near')) == (0.0, 0.0)
         sizes = forms.sizes({0: kernels})[0]
         assert np.isfinite(sizes).all()
@@ -179,11 +182,11 @@ def test_where_no_more_was_measured_than_fitted_nothing_is_shared():
 def test_neighbours_are_the_next_stop_and_the_three_nearest():
     """Within a set: those of another are far away in both senses, however few its own are."""
     rng = np.random.default_rng(0)
-    count, far = 14, shared_errors.ELSEWHERE
+    count, far = 14, ELSEWHERE
     number = np.repeat([0.0, 1.0], [11, 3])
     place = np.column_stack([rng.normal(size=(count, 2)), far * number])
     time = np.array([0, 1, 2, 4, 5, 6, 7, 9, 10, 12, 13, 3, 4, 6]) + far * number
-    units = shared_errors.Stops([], np.arange(1.0, 15.0), place, time, place)
+    units = Stops([], np.arange(1.0, 15.0), place, time, place)
     assert len(units) == count
     apart = cdist(place, place)
     nearest = np.argsort(apart, axis=1)[:, 1:4]
@@ -219,7 +222,7 @@ def test_stops_have_the_sums_of_their_samples(share, run, block, monkeypatch):
         samples_module.Samples(replace(poses, covariance=np.tile(own, (len(q), 1, 1))), *NOISE),
     )
     names = UR10E.parameter_names[:8]
-    units = shared_errors._gather(UR10E, names, System(sets), share, run)
+    units = gather(UR10E, names, System(sets), share, run)
     parts, counts, places, times = [[], []], [], [], []
     for number, samples in enumerate(sets):
         rows = samples.rows_of(UR10E, names)
@@ -234,7 +237,7 @@ def test_stops_have_the_sums_of_their_samples(share, run, block, monkeypatch):
                 parts[1].append(whole[:, 3:] * (number < 2))
                 counts.append(len(which))
                 here = q[which[0]]
-                far = shared_errors.ELSEWHERE * number
+                far = ELSEWHERE * number
                 places.append([*np.cos(here), *np.sin(here), far])
                 times.append(stop + far)
     for found, expected in zip(units.parts, parts, strict=True):
@@ -250,7 +253,7 @@ def test_the_rows_of_long_stops_are_never_all_in_memory():
     system = System((samples_module.Samples(seen, *NOISE),))
     names = UR10E.parameter_names
     tracemalloc.start()
-    units = shared_errors._gather(UR10E, names, system, 1, 20)
+    units = gather(UR10E, names, system, 1, 20)
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert units.count.tolist() == 8 * [5000]
@@ -267,7 +270,7 @@ def test_errors_near_in_joint_space_have_the_kernel_of_their_distance():
             whole = share**2 * kernel
             np.fill_diagonal(whole, share)
             expected = np.einsum('pcn,nm,rcm->pr', own, whole, own)
-            found = shared_errors._near(units, part, [(0.8, 1.0)], share)
+            found = faded_near(units, part, [(0.8, 1.0)], share)
             np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
@@ -276,7 +279,7 @@ def test_sizes_are_those_that_make_the_forms_as_large_as_they_are(width, monkeyp
     """Forms of exactly the expected values give back the sizes, of both parts."""
     units = drawn(np.random.default_rng(3), width=width)
     extra = np.random.default_rng(4).normal(size=(2, width))
-    forms = shared_errors._Forms(units, extra)
+    forms = quadratic_forms.QuadraticForms(units, extra)
     assert [*forms.parts] == [0, 1]
     kernels = {0: [('successive', 5.0), ('near', 0.5)], 1: [('near', 0.5)]}
     truth = [np.array([2.0, 0.0, 0.7]), np.array([0.3, 5.0])]
@@ -308,7 +311,7 @@ def test_where_nothing_is_left_nothing_is_shared():
     units = drawn(np.random.default_rng(6))
     for part in units.parts:
         part[-1] = 0.0
-    forms = shared_errors._Forms(units, np.zeros((0, 4)))
+    forms = quadratic_forms.QuadraticForms(units, np.zeros((0, 4)))
     assert forms.test(0, units.links('near')) == (0.0, 0.0)
 
 
@@ -320,7 +323,7 @@ def test_too_few_stops_share_nothing():
     found = shared_errors.shared_errors(minimise(true, names, system), names, system)
     assert (found.successive, found.near, found.found, found.middles) == (0.0, 0.0, (), {})
     weightless = system.weighted([np.zeros(7)])
-    assert not len(shared_errors._gather(true, names, weightless, 1, 20))
+    assert not len(gather(true, names, weightless, 1, 20))
 
 
 @pytest.mark.parametrize('most', [400, 20])
@@ -351,8 +354,8 @@ def test_the_middle_is_the_sum_of_all_that_a_test_finds(most, monkeypatch):
         }
         return sizes
 
-    monkeypatch.setattr(shared_errors._Forms, 'test', test)
-    monkeypatch.setattr(shared_errors._Forms, 'sizes', sized)
+    monkeypatch.setattr(quadratic_forms.QuadraticForms, 'test', test)
+    monkeypatch.setattr(quadratic_forms.QuadraticForms, 'sizes', sized)
     found = shared_errors.shared_errors(fit, names, system)
     assert (found.successive, found.near) == (0.0, 0.2)
     assert found.found == ('successive', 'near')

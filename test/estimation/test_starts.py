@@ -11,11 +11,11 @@ from fits import NOISE, SCARA, SIGMAS, UR10E, measured_arm, worst_prediction
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.estimation import robust, start
-from calib_ros.estimation.leastsquares import Prior, System
-from calib_ros.estimation.robust import _Halves, _Linear, trimmed_sum
+from calib_ros.estimation import start, trimmed
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.start import _shortest, closed_forms, start_frames
+from calib_ros.estimation.system import Prior, System
+from calib_ros.estimation.trimmed import _Halves, _Linear, trimmed_sum
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.se3 import norms
@@ -80,12 +80,12 @@ def test_halves_are_of_every_set_and_slightly_more(rng):
     """As many configurations are drawn as half of the parameters need, whole ones."""
     system = two_sets(rng)
     names = [*UR10E.joints[2].parameters[:3], 'tool.x', 'elbow_joint.a']
-    need = robust._need(names, system)  # the prior's parameter needs no equations
+    need = trimmed._need(names, system)  # the prior's parameter needs no equations
     assert need == pytest.approx(3.0 / (6 * 40 + 3 * 23))
     halves = _Halves(system, 0.25)
     assert halves.parts == [slice(0, 40), slice(40, 109)]
     drawn = halves.draw(0.25)
-    assert drawn.shape == (robust.STARTS, 109)
+    assert drawn.shape == (trimmed.STARTS, 109)
     np.testing.assert_array_equal(drawn[:, :40].sum(axis=1), 5)  # an eighth
     np.testing.assert_array_equal(drawn[:, 40:].sum(axis=1), 3 * 3)
     together = drawn[:, 40:].reshape(-1, 23, 3)
@@ -106,7 +106,7 @@ def test_halves_are_of_every_set_and_slightly_more(rng):
 def test_of_many_samples_an_even_spread_of_each_set_is_searched(counts, left, rng):
     """Two hundred in all: a hundred of each of two sets."""
     system = two_sets(rng, counts)
-    few = robust._thinned(system)
+    few = trimmed._thinned(system)
     assert tuple(samples.count for samples in few.sets) == left
     share = -(-counts[0] // left[0])
     np.testing.assert_array_equal(few.sets[0].joints, system.sets[0].joints[:, ::share])
@@ -115,7 +115,7 @@ def test_of_many_samples_an_even_spread_of_each_set_is_searched(counts, left, rn
 def test_of_many_sets_each_keeps_a_tenth_of_the_poses(rng):
     seen = measure(UR10E, UR10E.random_joints(60, rng), rng)
     system = System((Samples(seen, 1e-4, 3e-4),) * 12)
-    few = robust._thinned(system)
+    few = trimmed._thinned(system)
     assert [samples.count for samples in few.sets] == [20] * 12
 
 

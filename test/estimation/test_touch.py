@@ -18,10 +18,11 @@ from calib_ros.estimation import start
 from calib_ros.estimation.considered import lengths_of
 from calib_ros.estimation.evidence import Inference
 from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.leastsquares import System, triangular_factor
 from calib_ros.estimation.levels import LARGEST_SCALE, PRINTED, SCALE
+from calib_ros.estimation.normal import triangular_factor
 from calib_ros.estimation.pixels import samples_of
 from calib_ros.estimation.samples import Samples, residual_arrays
+from calib_ros.estimation.system import System
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame, Joint
 from calib_ros.kinematics.jacobian import ErrorModel

@@ -12,8 +12,8 @@ from fits import UR10E, measured_arm
 
 from calib_ros.decision.comparison import GroupVerdict, log_gain
 from calib_ros.decision.drift import Shifts
-from calib_ros.estimation.leastsquares import row_samples, stacked
 from calib_ros.estimation.problem import Learned, Problem
+from calib_ros.estimation.system import row_samples, stacked
 from calib_ros.identification import linear_model
 from calib_ros.identification.linear_model import LinearModel
 from calib_ros.kinematics import effects
