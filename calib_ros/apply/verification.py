@@ -33,9 +33,9 @@ from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import Observations, frames_of_sets
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER
 from calib_ros.estimation.samples import residual_arrays
 from calib_ros.estimation.start import in_new_frames, released
+from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame

@@ -33,9 +33,9 @@ from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, NEARER, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.start import fit_to_arm
+from calib_ros.estimation.weights import OUTLIER
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import Aim

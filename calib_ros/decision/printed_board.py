@@ -21,7 +21,7 @@ from calib_ros.estimation.levels import LARGEST_SCALE, SURE
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.pixels import seen_residuals
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER
+from calib_ros.estimation.weights import OUTLIER
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 

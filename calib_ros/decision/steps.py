@@ -34,9 +34,9 @@ from calib_ros.estimation.gross_errors import SUSPICIOUS
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
 from calib_ros.estimation.levels import LEAST_ASIDE, SURE, chance_of
 from calib_ros.estimation.pixels import in_view
-from calib_ros.estimation.robust import weights_of
 from calib_ros.estimation.samples import gram
 from calib_ros.estimation.system import System
+from calib_ros.estimation.weights import weights_of
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter

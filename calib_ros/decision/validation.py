@@ -19,7 +19,7 @@ from calib_ros.estimation.levels import ALIKE, SURE
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.posterior import Posterior
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER, distances_of
+from calib_ros.estimation.weights import OUTLIER, distances_of
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import Flags, FloatArray

@@ -23,12 +23,13 @@ from calib_ros.estimation.gross_errors import SUSPICIOUS, thorough_fit
 from calib_ros.estimation.identifiability import excited
 from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.levels import CONFIDENT
-from calib_ros.estimation.noise import Noise, noise_of, squares_of
+from calib_ros.estimation.noise import Noise, noise_of
 from calib_ros.estimation.normal import factor_of, triangular_factor
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.pixels import in_view
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.robust import reweighted
+from calib_ros.estimation.shared_errors import squares_of
 from calib_ros.estimation.sizes import LEAST_SIZE, SETTLED, SPREAD
 from calib_ros.estimation.start import start_frames
 from calib_ros.estimation.system import System

@@ -12,9 +12,10 @@ from scipy import special
 from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.levels import ALIKE, LEAST_ASIDE, NEARER, SURE
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.robust import INNER, Robust, reweighted, robust_fit
+from calib_ros.estimation.robust import Robust, reweighted, robust_fit
 from calib_ros.estimation.system import System
 from calib_ros.estimation.trimmed import squared_residuals, trimmed_start, trimmed_sum
+from calib_ros.estimation.weights import INNER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import ROUNDING
 

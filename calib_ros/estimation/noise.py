@@ -15,12 +15,10 @@ from calib_ros.estimation import uncertainty
 from calib_ros.estimation.gross_errors import SUSPICIOUS
 from calib_ros.estimation.leastsquares import Fit
 from calib_ros.estimation.levels import SURE
-from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.shared_errors import shared_errors
+from calib_ros.estimation.shared_errors import shared_errors, squares_of
 from calib_ros.estimation.system import System
 from calib_ros.estimation.uncertainty import Uncertainty
-from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.values import SAME
 
@@ -127,31 +125,3 @@ def noise_of(
         size = np.sqrt(np.median(np.diag(covariance.sum(axis=0)) / np.diag(plain)))
         noise = replace(noise, size=float(size))
     return noise, Uncertainty(covariance, freedom)
-
-
-def squares_of(chain: Chain, system: System) -> FloatArray:
-    """Return by part (4, 2) sums and counts of squared residuals, alone and over configurations.
-
-    If pairs of a configuration, of any targets, share no error, squares of their sums add up to
-    the same.
-    """
-    found = np.zeros((4, 2))
-    sums, counts, joint_sums, joint_counts = found  # views
-    shared: dict[tuple[int, str, int], FloatArray] = {}
-    every = numbered([samples.observations for samples in system.sets])
-    count = 1 + max(int(numbers.max(initial=-1)) for numbers in every)
-    for samples, numbers in zip(system.sets, every, strict=True):
-        seen = samples.observations
-        for k, part in enumerate(samples.whitened_residuals(chain)):
-            known = np.flatnonzero(~np.isnan(part[:, 0]))
-            roots = np.ones(len(known)) if samples.weights is None else samples.weights[known]
-            weighted = roots * part.take(known, axis=0).T
-            sums[k] += np.sum(weighted**2)
-            counts[k] += len(weighted) * (roots @ roots)
-            key = k, seen.tool if seen.seen else seen.base, len(weighted)
-            together = shared.setdefault(key, np.zeros((len(weighted), count)))
-            together += [np.bincount(numbers[known], row, count) for row in weighted]
-    for (k, *_), together in shared.items():
-        joint_sums[k] += np.sum(together**2)
-        joint_counts[k] += len(together) * np.count_nonzero(together.any(axis=0))
-    return found

@@ -21,8 +21,8 @@ import numpy as np
 from calib_ros.estimation.levels import MOST_OUTLIERS
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.resection import image_products
-from calib_ros.estimation.robust import INNER
 from calib_ros.estimation.samples import BLOCK, Both, Samples, cached
+from calib_ros.estimation.weights import INNER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.lens import Projection, require_lens, view

@@ -25,14 +25,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from scipy import special
 
 from calib_ros.estimation.fading import faded_in_succession, faded_near
 from calib_ros.estimation.leastsquares import Fit
 from calib_ros.estimation.levels import CERTAIN, TELLING
+from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.quadratic_forms import QuadraticForms
 from calib_ros.estimation.stops import MOST_STOPS, gather, gathered
 from calib_ros.estimation.system import System
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 
 DECAYS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
@@ -97,3 +100,31 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
         middles[part] += middle
     found = tuple(kind for kind in kinds if any(kind in each for each in alike.values()))
     return Shared(**correlations, found=found, middles=middles)
+
+
+def squares_of(chain: Chain, system: System) -> FloatArray:
+    """Return by part (4, 2) sums and counts of squared residuals, alone and over configurations.
+
+    If pairs of a configuration, of any targets, share no error, squares of their sums add up to
+    the same.
+    """
+    found = np.zeros((4, 2))
+    sums, counts, joint_sums, joint_counts = found  # views
+    shared: dict[tuple[int, str, int], FloatArray] = {}
+    every = numbered([samples.observations for samples in system.sets])
+    count = 1 + max(int(numbers.max(initial=-1)) for numbers in every)
+    for samples, numbers in zip(system.sets, every, strict=True):
+        seen = samples.observations
+        for k, part in enumerate(samples.whitened_residuals(chain)):
+            known = np.flatnonzero(~np.isnan(part[:, 0]))
+            roots = np.ones(len(known)) if samples.weights is None else samples.weights[known]
+            weighted = roots * part.take(known, axis=0).T
+            sums[k] += np.sum(weighted**2)
+            counts[k] += len(weighted) * (roots @ roots)
+            key = k, seen.tool if seen.seen else seen.base, len(weighted)
+            together = shared.setdefault(key, np.zeros((len(weighted), count)))
+            together += [np.bincount(numbers[known], row, count) for row in weighted]
+    for (k, *_), together in shared.items():
+        joint_sums[k] += np.sum(together**2)
+        joint_counts[k] += len(together) * np.count_nonzero(together.any(axis=0))
+    return found

@@ -37,9 +37,9 @@ from calib_ros.estimation.normal import products_of
 from calib_ros.estimation.nuisances import Nuisances, nuisance_products
 from calib_ros.estimation.observations import SOME_POSES, Observations, frames_of_sets, numbered
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER
 from calib_ros.estimation.start import in_new_frames, released
 from calib_ros.estimation.system import System
+from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.age import drift_of, recorded_time
 from calib_ros.identification.calibration import Calibration, about, provenance
 from calib_ros.identification.recalibrated import Recalibration

@@ -26,11 +26,12 @@ from calib_ros.estimation.levels import SURE
 from calib_ros.estimation.normal import normal_equations
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTER, robust_fit
+from calib_ros.estimation.robust import robust_fit
 from calib_ros.estimation.samples import residual_arrays
 from calib_ros.estimation.sizes import solved
 from calib_ros.estimation.start import start_frames
 from calib_ros.estimation.system import Prior
+from calib_ros.estimation.weights import OUTER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import DELAY, DH_ANGLES, IN_A_FRAME, Parameter

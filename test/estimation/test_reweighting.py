@@ -14,9 +14,9 @@ from calib_ros.apply.simulation import measure
 from calib_ros.estimation import gross_errors, robust
 from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import INNER, OUTER, distances_of, weights_of
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.system import System
+from calib_ros.estimation.weights import INNER, OUTER, distances_of, weights_of
 from calib_ros.kinematics import se3
 
 

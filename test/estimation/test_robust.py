@@ -8,7 +8,7 @@ from fits import NO_PRIOR, NOISE, UR10E, directions, fitted, measured_arm, rms, 
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER
+from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
