@@ -28,9 +28,9 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from real_robots import DATA, problem_of
 
-from calib_ros.apply.candidates import iso_9283_poses
 from calib_ros.apply.confidence import freedom_of, rms_limits
 from calib_ros.apply.design import Design
+from calib_ros.apply.iso_9283 import iso_9283_poses
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.apply.verification import verify
 from calib_ros.decision.residuals import residuals

@@ -22,9 +22,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from calib_ros.annotated import Confidence, InMetres, as_annotated
-from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import Judgement, judge, limits_of, moments_of, rms_of
+from calib_ros.apply.iso_9283 import TILTED
 from calib_ros.decision.comparison import Comparison, along_base, compare
 from calib_ros.decision.moved import Step
 from calib_ros.decision.residuals import axes_of, by_axes
@@ -38,8 +38,9 @@ from calib_ros.estimation.start import in_new_frames, released
 from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain, Frame
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.effects import coupled
+from calib_ros.kinematics.joint import Frame
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.apply import planning
-from calib_ros.apply.candidates import Visibility, draw_candidates, iso_9283_poses
+from calib_ros.apply.candidates import Visibility, draw_candidates
 from calib_ros.apply.design import ASSUMED_TOOL, Design
+from calib_ros.apply.iso_9283 import iso_9283_poses
 from calib_ros.apply.planning import Plan
 from calib_ros.apply.simulation import measure
 from calib_ros.atomic import write_together

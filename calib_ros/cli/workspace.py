@@ -8,8 +8,9 @@ import argparse
 
 import numpy as np
 
-from calib_ros.apply import workspace
-from calib_ros.apply.workspace import Survey, in_base, regions, task_of
+from calib_ros.apply import placement, workspace
+from calib_ros.apply.task import task_of
+from calib_ros.apply.workspace import Survey, in_base, regions
 from calib_ros.cli import common, inputs
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -57,7 +58,7 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
         region = None if options.region is None else np.reshape(options.region, (2, 3))
         with screen.work('placing the task') as work:
             where = (region, options.cells, options.turns)
-            found = workspace.place(arm, task, options.aim, options.model, *where, progress=work)
+            found = placement.place(arm, task, options.aim, options.model, *where, progress=work)
         screen.bullet(f'Expected {options.aim} error of the task, {options.model} model')
         screen.bullet(placed_in_words(found))
         table = np.column_stack([found.positions, found.turns, found.errors])

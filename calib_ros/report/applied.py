@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib_ros.apply.placement import Placements
 from calib_ros.apply.planning import Plan
-from calib_ros.apply.workspace import Placements, Survey, in_base, regions, spread
+from calib_ros.apply.workspace import Survey, in_base, regions, spread
 from calib_ros.decision.changes import reason_in_words
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibrated import Recalibration

@@ -16,7 +16,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from calib_ros.apply.workspace import Placements, Survey, rms_map
+from calib_ros.apply.placement import Placements
+from calib_ros.apply.workspace import Survey, rms_map
 from calib_ros.decision.result import Identification
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.figures import AFTER, BEFORE

@@ -8,7 +8,9 @@ from fits import measured_arm
 
 from calib_ros import Calibration, Chain, Problem, identify
 from calib_ros.apply import workspace
-from calib_ros.apply.workspace import in_base, place, task_of
+from calib_ros.apply.placement import place
+from calib_ros.apply.task import task_of
+from calib_ros.apply.workspace import in_base
 from calib_ros.cli.workspace import _task
 from calib_ros.errors import CalibrationError, ConfigError, InputError
 from calib_ros.kinematics.chain import Joint
