@@ -23,7 +23,8 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
 
-from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, photograph
+from calib_ros.apply.camera import Camera, before_camera, photograph
+from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.errors import InputError
 from calib_ros.estimation import uncertainty
 from calib_ros.estimation.normal import normal_equations, triangular_factor

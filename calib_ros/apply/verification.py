@@ -7,7 +7,7 @@ pose, so its error is measured - C(q); uncorrected it would be measured - N(q). 
 the joint values that the controller reports. If the uncorrected program is known, the wanted pose
 is N(q_commanded), and a missing correction shows as well.
 
-The verdict is that of `confidence.py`. On request, frames of the new measurements are fitted to
+The verdict is that of `judgement.py`. On request, frames of the new measurements are fitted to
 both arms: the base if the device was moved, the tool if the target was changed or remounted. The
 change of any other frame counts as an error of the arm.
 """
@@ -23,8 +23,9 @@ from scipy.spatial import cKDTree
 
 from calib_ros.annotated import Confidence, InMetres, as_annotated
 from calib_ros.apply.compensation import Compensator
-from calib_ros.apply.confidence import Judgement, judge, limits_of, moments_of, rms_of
+from calib_ros.apply.confidence import limits_of, moments_of, rms_of
 from calib_ros.apply.iso_9283 import TILTED
+from calib_ros.apply.judgement import Judgement, judge
 from calib_ros.decision.comparison import Comparison, along_base, compare
 from calib_ros.decision.moved import Step
 from calib_ros.decision.residuals import axes_of, by_axes

@@ -16,7 +16,8 @@ from urllib.parse import quote
 import numpy as np
 
 import calib_ros
-from calib_ros.apply.confidence import Judgement, interval_of
+from calib_ros.apply.confidence import interval_of
+from calib_ros.apply.judgement import Judgement
 from calib_ros.decision.residuals import ErrorFigures
 from calib_ros.decision.result import Identification
 from calib_ros.errors import LONGEST_NAME, ConfigError

@@ -9,7 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.apply.confidence import compared, interval_of
+from calib_ros.apply.confidence import interval_of
+from calib_ros.apply.judgement import compared
 from calib_ros.apply.workspace import survey
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.reasons import Rule

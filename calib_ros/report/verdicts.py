@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.apply.confidence import DECIDING
+from calib_ros.apply.judgement import DECIDING
 from calib_ros.apply.verification import Verification
 from calib_ros.estimation.levels import ALIKE, NEARER
 from calib_ros.identification.records import reused_in_words

@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from calib_ros.apply.confidence import Judgement, interval_of
+from calib_ros.apply.confidence import interval_of
+from calib_ros.apply.judgement import Judgement
 from calib_ros.decision.changes import FALSE_ALARM, changes_in_words
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.misfits import Outlier

@@ -23,7 +23,7 @@ from rclpy.clock import Clock, ClockType
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from calib_ros.apply.confidence import judge
+from calib_ros.apply.judgement import judge
 from calib_ros.atomic import given_path
 from calib_ros.errors import CalibrationError, ConfigError, InputError
 from calib_ros.estimation.observations import Observations

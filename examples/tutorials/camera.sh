@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from calib_ros import load_chain
-from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, photograph
+from calib_ros.apply.camera import Camera, before_camera, photograph
+from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.files.boards import read_board
 
 rng = np.random.default_rng(5)

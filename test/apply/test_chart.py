@@ -10,7 +10,8 @@ from verified import with_errors
 
 from calib_ros.apply import simulation
 from calib_ros.apply.chart import drift, run_length
-from calib_ros.apply.confidence import judge, rms_interval
+from calib_ros.apply.confidence import rms_interval
+from calib_ros.apply.judgement import judge
 from calib_ros.apply.verification import verify
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.se3 import invert

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib_ros.apply.simulation import Camera, Cell, _facing, before_camera, drive, photograph
+from calib_ros.apply.camera import Camera, _facing, before_camera, photograph
+from calib_ros.apply.simulation import Cell, drive
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain_file import load_chain
 

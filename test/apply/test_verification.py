@@ -156,7 +156,7 @@ def test_the_limits_hold_as_often_as_they_say(shape, count):
 
 
 def test_the_limits_of_a_verdict_are_those(arm, monkeypatch):
-    monkeypatch.setattr('calib_ros.apply.confidence.DECIDING', 5)  # fewer than were measured
+    monkeypatch.setattr('calib_ros.apply.judgement.DECIDING', 5)  # fewer than were measured
     errors = np.random.default_rng(0).normal(scale=1e-4, size=(7, 3))
     found = verify(arm, [with_errors(arm, errors)], 1e-4)
     wanted = rms_interval(errors, np.arange(7))

@@ -9,7 +9,7 @@ import pytest
 from fits import arm
 
 from calib_ros import Problem, identify, load_chain
-from calib_ros.apply.simulation import Camera, before_camera, photograph
+from calib_ros.apply.camera import Camera, before_camera, photograph
 from calib_ros.decision import plausibility
 from calib_ros.decision.mistakes import diagnose
 from calib_ros.decision.reasons import Rule

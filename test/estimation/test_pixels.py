@@ -13,7 +13,8 @@ from fits import rms
 from measured import rows_of, write_csv, write_images
 
 from calib_ros import Observations, Problem, identify, load_chain
-from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
+from calib_ros.apply.camera import Camera, before_camera, photograph
+from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.mistakes import diagnose
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.normal import products_of

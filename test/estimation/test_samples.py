@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from fits import UR10E, arm
 
-from calib_ros.apply.simulation import Camera, before_camera, measure, photograph
+from calib_ros.apply.camera import Camera, before_camera, photograph
+from calib_ros.apply.simulation import measure
 from calib_ros.estimation import samples as samples_module
 from calib_ros.estimation.pixels import seen_residuals
 from calib_ros.estimation.samples import Samples, residual_arrays

@@ -11,7 +11,7 @@ from pages import page_of, problem_of, report_of
 from plotly import graph_objects
 
 from calib_ros import Observations, Settings, identify, load_chain
-from calib_ros.apply.simulation import Camera, before_camera, photograph
+from calib_ros.apply.camera import Camera, before_camera, photograph
 from calib_ros.decision.comparison import GroupVerdict, compare
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame

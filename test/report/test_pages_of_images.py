@@ -10,7 +10,8 @@ import pytest
 from measured import write_images, write_places
 from pages import Page
 
-from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, photograph
+from calib_ros.apply.camera import Camera, before_camera, photograph
+from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.cli.common import Status
 from calib_ros.kinematics.chain_file import load_chain
 

@@ -9,7 +9,7 @@ import pytest
 from pages import problem_of, report_of
 from verified import in_words, verification_page
 
-from calib_ros.apply.confidence import judge
+from calib_ros.apply.judgement import judge
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
 from calib_ros.decision.changes import Explanation

@@ -15,14 +15,8 @@ from recorded import TYPES, serialised, write
 from ros_cell import LATCHED, PATIENCE, START, Cell, header, joint_messages, stamp_ns
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
 
-from calib_ros.apply.simulation import (
-    Camera,
-    Cell as SimulatedCell,
-    before_camera,
-    drive,
-    faulty,
-    photograph,
-)
+from calib_ros.apply.camera import Camera, before_camera, photograph
+from calib_ros.apply.simulation import Cell as SimulatedCell, drive, faulty
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.files.bags import replay
 from calib_ros.files.cameras import cameras_of, lens_in

@@ -8,7 +8,7 @@ import pytest
 from sessions import TRUE, UR5E, drive, samples, session, tracker
 from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, take
 
-from calib_ros.apply.confidence import judge
+from calib_ros.apply.judgement import judge
 from calib_ros.apply.simulation import random_frame
 from calib_ros.errors import InputError
 from calib_ros.identification.calibration import Calibration, parse_calibration

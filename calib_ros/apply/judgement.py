@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict on a calibrated arm by its errors at new measurements.
+
+With the wanted RMS error as limit, and the interval of `confidence.py`, it is
+
+    PASS        the whole interval is within the limit
+    FAIL        the whole interval is beyond it
+    UNDECIDED   the limit lies in the interval: more poses are needed
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from calib_ros.apply.confidence import limits_of, moments_of
+from calib_ros.decision import mistakes
+from calib_ros.decision.comparison import Comparison, along_base, compare
+from calib_ros.errors import MOST_ENTRIES
+from calib_ros.estimation.levels import CONFIDENT
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.identification.calibration import Calibration
+from calib_ros.kinematics.se3 import Index
+from calib_ros.settings import Settings
+
+Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
+STANDS: dict[Verdict, Verdict] = {'PASS': 'holds', 'FAIL': 'does not hold'}
+DECIDING = 10 * MOST_ENTRIES  # largest number of configurations reported as deciding
+
+
+def compared(limit: float, lower: float, upper: float) -> Literal['PASS', 'FAIL', 'UNDECIDED']:
+    """Return the verdict on an RMS error by its interval."""
+    return 'PASS' if upper <= limit else 'FAIL' if lower > limit else 'UNDECIDED'
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Judgement:
+    """Errors of new measurements before and after a correction, and the verdict."""
+
+    comparison: Comparison
+    """Residuals by the nominal and by the calibrated arm, along the axes of its base."""
+    limit: float | None
+    """The tolerance, or else the largest error [m] of a calibration that holds, if known."""
+    confidence: float
+    """Of the interval."""
+    rms: float
+    lower: float
+    upper: float
+    """RMS position error [m] over poses like these, and its interval."""
+    freedom: float
+    """Degrees of freedom of that error."""
+    verdict: Verdict
+    """Without a tolerance 'holds' and 'does not hold' instead of PASS and FAIL, or 'no verdict' if
+    the former error is unknown; no verdict either if fitted measurements look good, or if a
+    `mistake` explains them."""
+    needed: int | None
+    """Configurations that would decide with the same RMS error; None if not even DECIDING."""
+    reused: float
+    """Share of the measurements that the calibration was fitted to (`Calibration.reused`)."""
+    mistake: mistakes.Diagnosis | None
+    """What explains measurements that are further off than any arm."""
+
+    @property
+    def failed(self) -> bool:
+        """Tell whether the error is beyond the limit."""
+        return self.verdict in ('FAIL', 'does not hold')
+
+    @property
+    def group(self) -> Index:
+        """Return the configuration (N,) of each measurement; `configurations` counts them."""
+        return self.comparison.before.configurations
+
+    @property
+    def configurations(self) -> int:
+        """Return the number of different configurations."""
+        return int(self.group.max()) + 1
+
+
+def judge(
+    arm: Calibration,
+    sets: Sequence[Observations],
+    found: Comparison | None = None,
+    tolerance: float | None = None,
+    confidence: float = CONFIDENT,
+    lost: int = 0,
+    of_messages: bool = False,
+) -> Judgement:
+    """Judge a calibrated arm by its errors at new measurements, in its frames if not given.
+
+    Each configuration counts once, however often it was measured; fitted frames have absorbed the
+    errors of `lost` ones. Without a `tolerance` [m] the limit is that of the calibration. Remedies
+    of a mistake are those of messages or of tables.
+    """
+    found = found or along_base(compare(arm.before, arm.chain, sets), arm.chain, sets)
+    moments = moments_of(found.after.position, found.before.configurations)
+    rms, numbers, freedom, lower, upper = limits_of(moments, lost, confidence, DECIDING)
+    angle = 1e-3 * (found.figures[1].rms_mrad or 0.0)
+    mistake = _mistake(arm, sets, rms, angle, of_messages)
+    reused, limit = arm.reused(sets), tolerance or arm.limit(sets, found.figures[0].rms_mm)
+    verdict: Verdict = 'no verdict'
+    if limit is not None and not mistake:
+        verdict = compared(limit, lower[0], upper[0])
+        decided = numbers[(upper <= limit) | (lower > limit)]
+    if reused and verdict != 'FAIL':
+        verdict = 'no verdict'
+    return Judgement(
+        comparison=found,
+        limit=limit,
+        confidence=confidence,
+        rms=rms,
+        lower=float(lower[0]),
+        upper=float(upper[0]),
+        freedom=float(freedom[0]),
+        verdict=STANDS.get(verdict, verdict) if tolerance is None else verdict,
+        needed=None if verdict == 'no verdict' or not decided.size else int(decided[0]),
+        reused=reused,
+        mistake=mistake,
+    )
+
+
+def _mistake(
+    arm: Calibration, sets: Sequence[Observations], error: float, angle: float, of_messages: bool
+) -> mistakes.Diagnosis | None:
+    if error <= Settings.largest_error and angle <= Settings.largest_angle:
+        return None
+    problem = Problem(arm.before, sets[0], more=sets[1:], of_messages=of_messages)
+    found = mistakes.diagnose(problem, far=True) or mistakes.diagnose_alone(problem, arm.chain)
+    known = error > Settings.largest_error or (found and found.alone)  # else positions fit
+    return found if known else None
