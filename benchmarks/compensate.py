@@ -30,7 +30,8 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from scipy.optimize import least_squares, root
 
-from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.compensation import compensate
+from calib_ros.apply.compensator import Compensator
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify

@@ -44,7 +44,8 @@ import numpy as np
 from cell_simulator import misfit, rms
 from harm_designs import DESIGNS, GOOD, session
 
-from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.compensation import compensate
+from calib_ros.apply.compensator import Compensator
 from calib_ros.errors import CalibrationError
 from calib_ros.identification.identification import identify, identify_model
 

@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The public interface: `__init__.py` reads where each name is, type checkers what it is."""
 
-from calib_ros.apply.compensation import Compensator as Compensator, compensate as compensate
+from calib_ros.apply.compensation import compensate as compensate
+from calib_ros.apply.compensator import Compensator as Compensator
 from calib_ros.apply.design import Design as Design
 from calib_ros.apply.planning import Plan as Plan, plan as plan
 from calib_ros.apply.program import Program as Program
-from calib_ros.apply.verification import Verification as Verification, verify as verify
+from calib_ros.apply.verification import verify as verify
+from calib_ros.apply.verified import Verification as Verification
 from calib_ros.decision.result import Identification as Identification
 from calib_ros.errors import CalibrationError as CalibrationError
 from calib_ros.estimation.observations import Observations as Observations

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.compensation import compensate
+from calib_ros.apply.compensator import Compensator
 from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame

@@ -10,14 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib_ros.annotated import check_fields
-from calib_ros.apply.compensation import (
-    Compensation,
-    Compensator,
-    Refusal,
-    add_refusals,
-    compensate,
-    too_fast,
-)
+from calib_ros.apply.compensation import compensate
+from calib_ros.apply.compensator import Compensation, Compensator, Refusal
+from calib_ros.apply.refused import add_refusals, too_fast
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index

@@ -37,7 +37,8 @@ def _compare(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _compensate(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.apply.compensation import Compensator, in_words
+    from calib_ros.apply.compensation import in_words
+    from calib_ros.apply.compensator import Compensator
     from calib_ros.apply.program import compensate_program
     from calib_ros.files.programs import program_of
 

@@ -8,7 +8,8 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from calib_ros.apply.verification import Verification, verify
+from calib_ros.apply.verification import verify
+from calib_ros.apply.verified import Verification
 from calib_ros.cli import common, inputs
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import GOOD_OR_BAD, Screen

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import calib_ros
-from calib_ros.apply.verification import Verification
+from calib_ros.apply.verified import Verification
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.fitted import ParameterRow

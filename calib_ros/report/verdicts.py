@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.apply.judgement import DECIDING
-from calib_ros.apply.verification import Verification
+from calib_ros.apply.verified import Verification
 from calib_ros.estimation.levels import ALIKE, NEARER
 from calib_ros.identification.records import reused_in_words
 from calib_ros.kinematics.chain import Chain

@@ -20,10 +20,12 @@ from commanded import (
 )
 from scipy.optimize import least_squares
 
-from calib_ros.apply.compensation import EXACT, Compensator, compensate, in_words
+from calib_ros.apply.compensation import compensate, in_words
+from calib_ros.apply.compensator import Compensator
 from calib_ros.apply.simulation import faulty
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.follower import mobility
+from calib_ros.settings import EXACT
 
 ENDS = {'lower': -2.5, 'upper': 2.5}
 PLANAR = [

@@ -9,7 +9,8 @@ import pytest
 import yaml
 from commanded import UR, UR_TRUE, regular
 
-from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.compensation import compensate
+from calib_ros.apply.compensator import Compensator
 from calib_ros.apply.simulation import measure
 from calib_ros.cli.common import Status
 from calib_ros.errors import InputError

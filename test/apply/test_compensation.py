@@ -19,13 +19,15 @@ from commanded import (
 )
 from hypothesis import given, strategies as st
 
-from calib_ros.apply.compensation import EXACT, Compensator, compensate, in_words
+from calib_ros.apply.compensation import compensate, in_words
+from calib_ros.apply.compensator import Compensator
 from calib_ros.apply.program import approaches
 from calib_ros.apply.simulation import faulty
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics import effects, follower
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.follower import mobility
+from calib_ros.settings import EXACT
 
 SIX = ['puma560', 'staubli_tx90l', 'ur10e']
 REDUNDANT = ['kuka_iiwa14', 'ur10e_on_linear_axis']

@@ -10,10 +10,11 @@ import pytest
 from commanded import CELL, missed, regular
 
 from calib_ros import Calibration, Problem, identify, recalibrate
-from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.both_arms import _match_commands
+from calib_ros.apply.compensation import compensate
+from calib_ros.apply.compensator import Compensator
 from calib_ros.apply.program import Program, compensate_program
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.apply.verification import _match_commands
 from calib_ros.errors import InputError
 from calib_ros.files.programs import program_of, read_joints
 from calib_ros.kinematics.chain import Chain, Joint

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from commanded import CELL, ROBOTS, UR, UR_TRUE, at_limit, missed, only_refusal, regular
 
-from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.compensation import compensate
+from calib_ros.apply.compensator import Compensator
 from calib_ros.apply.program import Program, approaches, compensate_program
 from calib_ros.apply.simulation import faulty
 from calib_ros.errors import InputError, UnknownNameError

@@ -10,10 +10,12 @@ from scipy.spatial.transform import Rotation
 from verified import NOISE, UR, in_words, measured, verification_page, with_errors
 
 from calib_ros.apply import simulation
-from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.compensation import compensate
+from calib_ros.apply.compensator import Compensator
 from calib_ros.apply.confidence import rms_interval, rms_limits
 from calib_ros.apply.iso_9283 import iso_9283_poses
-from calib_ros.apply.verification import Attained, verify
+from calib_ros.apply.verification import verify
+from calib_ros.apply.verified import Attained
 from calib_ros.decision.residuals import Residuals
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain import Chain

@@ -16,7 +16,8 @@ from sessions import samples
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.compensation import compensate
+from calib_ros.apply.compensator import Compensator
 from calib_ros.errors import InputError
 from calib_ros.files.programs import joints_csv
 from calib_ros.identification.calibration import Calibration
