@@ -39,7 +39,7 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.identifiability import independent
 from calib_ros.estimation.observability import indices_of
-from calib_ros.kinematics.inverse import check_limits
+from calib_ros.kinematics.limits import check_limits
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Criterion

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.apply.compensator import Compensation, Compensator, Refusal
-from calib_ros.kinematics.inverse import a_turn_away
+from calib_ros.kinematics.limits import a_turn_away
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import EXACT, TURN_IN_PART
 

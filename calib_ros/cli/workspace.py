@@ -17,7 +17,7 @@ from calib_ros.errors import InputError
 from calib_ros.files.programs import csv_of, joints_csv, read_poses
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.kinematics.inverse import check_limits
+from calib_ros.kinematics.limits import check_limits
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.applied import placed_in_words, workspace_report
 from calib_ros.report.page import markdown

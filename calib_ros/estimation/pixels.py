@@ -25,8 +25,9 @@ from calib_ros.estimation.samples import BLOCK, Both, Samples, cached
 from calib_ros.estimation.weights import INNER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.lens import Projection, require_lens, view
+from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import LENS_KINDS, parameters_of
+from calib_ros.kinematics.projection import Projection, view
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index, norms
 from calib_ros.values import LARGEST
 

@@ -20,8 +20,9 @@ from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import NEARER
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.lens import Lens, Projection, view
+from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.newton import NormalBatch, minimise_batch
+from calib_ros.kinematics.projection import Projection, view
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 
 

@@ -26,7 +26,7 @@ from calib_ros.files.sheets import decimal_sign, refuse_short, text_and_separato
 from calib_ros.files.vocabulary import ANGLES, LENGTHS, POSE_COLUMNS, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.inverse import check_limits, check_turns
+from calib_ros.kinematics.limits import check_limits, check_turns
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
 from calib_ros.values import parse_numbers

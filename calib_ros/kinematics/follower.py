@@ -31,8 +31,9 @@ from typing import NamedTuple
 import numpy as np
 
 from calib_ros.kinematics.chain import Chain, Frame
-from calib_ros.kinematics.inverse import Aim, limits
+from calib_ros.kinematics.inverse import Aim
 from calib_ros.kinematics.jacobian import orientation_error
+from calib_ros.kinematics.limits import limits
 from calib_ros.kinematics.newton import Minimum, NormalBatch, minimise_batch
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, Flags, FloatArray, Index, transform
 from calib_ros.kinematics.walk import BLOCK

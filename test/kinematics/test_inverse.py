@@ -9,7 +9,8 @@ from commanded import twist
 from calib_ros.apply import simulation
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, shipped_robots
-from calib_ros.kinematics.inverse import a_turn_away, limits, solve
+from calib_ros.kinematics.inverse import solve
+from calib_ros.kinematics.limits import a_turn_away, limits
 from calib_ros.values import SAME
 
 
