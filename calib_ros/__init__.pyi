@@ -28,10 +28,8 @@ from calib_ros.identification.recalibrated import Recalibration as Recalibration
 from calib_ros.identification.recalibration import recalibrate as recalibrate
 from calib_ros.kinematics.chain import Chain as Chain
 from calib_ros.kinematics.chain_file import dump_chain as dump_chain, load_chain as load_chain
-from calib_ros.kinematics.urdf import (
-    chain_from_urdf as chain_from_urdf,
-    corrected_urdf as corrected_urdf,
-)
+from calib_ros.kinematics.corrected_urdf import corrected_urdf as corrected_urdf
+from calib_ros.kinematics.urdf import chain_from_urdf as chain_from_urdf
 from calib_ros.sampling.session import CalibrationSession as CalibrationSession
 from calib_ros.settings import Settings as Settings
 

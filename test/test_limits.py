@@ -105,7 +105,7 @@ def urdf(links, kind='fixed', axis='0 0 1'):
 
 def test_the_most_links_are_read_and_more_refused(monkeypatch):
     most = 2 * sys.getrecursionlimit()
-    monkeypatch.setattr('calib_ros.kinematics.urdf_tree.MOST_LINKS', most)
+    monkeypatch.setattr('calib_ros.kinematics.urdf_reader.MOST_LINKS', most)
     assert len(chain_from_urdf(urdf(most)).joints) == 1
     with pytest.raises(ConfigError, match=f'more than {most} links'):
         chain_from_urdf(urdf(most + 1))

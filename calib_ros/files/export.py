@@ -32,13 +32,14 @@ from calib_ros.errors import CalibrationError
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics import se3
+from calib_ros.kinematics.axes import with_common_normals
 from calib_ros.kinematics.chain import PARALLEL_TOLERANCE, Chain, Convention, Frame, Joint
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
+from calib_ros.kinematics.corrected_urdf import corrected_urdf
 from calib_ros.kinematics.effects import group_of
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
-from calib_ros.kinematics.urdf import corrected_urdf, with_common_normals
-from calib_ros.kinematics.urdf_tree import to_rpy
+from calib_ros.kinematics.urdf_editor import to_rpy
 from calib_ros.texts import csv_text, dump_yaml, from_cell, parse_yaml, to_cell
 from calib_ros.values import SAME
 

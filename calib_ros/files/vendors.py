@@ -27,9 +27,10 @@ from calib_ros.errors import ConfigError
 from calib_ros.files import export
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
+from calib_ros.kinematics.corrected_urdf import corrected_urdf
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
-from calib_ros.kinematics.urdf_tree import parse_urdf
+from calib_ros.kinematics.urdf import chain_from_urdf
+from calib_ros.kinematics.urdf_reader import parse_urdf
 from calib_ros.texts import dump_yaml, parse_yaml
 from calib_ros.values import SAME
 

@@ -1,21 +1,12 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The chain from a robot description (URDF), and the corrected arm back into it.
+"""The chain from a robot description (URDF).
 
     URDF     T_base_tip(q) = O_1 M_1(q_1) ... O_n M_n(q_n) O_tip
     chain    T_base_tip(q) = base A_1(q_1) ... A_n(q_n) tool
 
 O are origins of joints, fixed joints multiplied in; M turns about an axis, or shifts along it.
-Only the lines of the axes at q = 0 matter. In both conventions the same five parameters lead from
-a frame on one axis to a frame on the next,
-
-    Rz(theta_i) Tz(d_i) Tx(a) Rx(alpha) Ry(beta)
-
-with a, alpha and beta in row i of the standard convention and in row i + 1 of the modified one.
-Skew or intersecting axes take their common normal, with beta = 0. (Nearly) parallel ones take
-d = 0: theta and a lead to the point where the next axis pierces the plane across this one, alpha
-and beta tilt z into it. Nothing is divided by the angle between the axes there, so the tilts in a
-calibrated URDF give no absurd lengths (Hayati and Mirmirani 1985).
+Only the lines of the axes at q = 0 matter (`axes.py`).
 """
 
 from __future__ import annotations
@@ -28,23 +19,12 @@ import numpy as np
 from calib_ros.annotated import as_annotated
 from calib_ros.errors import ConfigError
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import (
-    PARALLEL_TOLERANCE,
-    Chain,
-    Convention,
-    Frame,
-    Joint,
-    JointType,
-    nearly_parallel,
-    refuse_other_joints,
-)
+from calib_ros.kinematics.axes import clean, link_ends, row_to_axis
+from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint, JointType
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, edited, parse_urdf
-from calib_ros.settings import Settings
-from calib_ros.values import MOST_NAMES, SAME
-
-MOST_APART = 2.0 * Settings.largest_angle
-"""Mean pose difference [m or rad] at which a chain is not the arm of a URDF."""
+from calib_ros.kinematics.urdf_reader import parse_urdf
+from calib_ros.kinematics.urdf_tree import DescribedJoint, Description
+from calib_ros.values import MOST_NAMES
 
 
 @as_annotated
@@ -83,18 +63,18 @@ def chain_from_urdf(
     frame = first = _first_frame(places[0], axes[0])
     rows = [_row(joint) for joint in moving]
     for i in range(len(rows) - 1):
-        rows[i] = _row_to_axis(rows[i], frame, axes[i + 1], places[i + 1][:3, 3])
-        frame = frame @ _ends(Chain('row', 'standard', (rows[i],)))[0]
-    rows[-1] = replace(rows[-1], d=_clean(float(frame[:3, 2] @ (tip - frame)[:3, 3])))
+        rows[i] = row_to_axis(rows[i], frame, axes[i + 1], places[i + 1][:3, 3])
+        frame = frame @ link_ends(Chain('row', 'standard', (rows[i],)))[0]
+    rows[-1] = replace(rows[-1], d=clean(float(frame[:3, 2] @ (tip - frame)[:3, 3])))
     if convention == 'modified':  # bends are in the next row
         bends = [Joint('straight'), *rows[:-1]]
         pairs = zip(rows, bends, strict=True)
         rows = [replace(row, a=bend.a, alpha=bend.alpha, beta=bend.beta) for row, bend in pairs]
-    x, y, z = (_clean(Chain.gravity[2] * part) for part in first[2, :3].tolist())
+    x, y, z = (clean(Chain.gravity[2] * part) for part in first[2, :3].tolist())
     chain = Chain(robot.name, convention, tuple(rows), base=Frame(first), gravity=(x, y, z))
-    couplings = {_coupling(joint): joint.follows[1] for joint in moving if joint.follows}
+    couplings = {coupling_of(joint): joint.follows[1] for joint in moving if joint.follows}
     chain = chain.with_effect_values(couplings)
-    ends = _ends(chain)
+    ends = link_ends(chain)
     return replace(
         chain,
         joints=_with_masses(rows, ends, robot, moving, poses),
@@ -102,99 +82,7 @@ def chain_from_urdf(
     )
 
 
-@as_annotated
-def corrected_urdf(
-    text: str, chain: Chain, base_link: str | None = None, tip_link: str | None = None
-) -> str:
-    """Return a URDF with the forward kinematics of a corrected arm between two links.
-
-    Only `<origin>` of joints on the path changes, and the `multiplier` of those that mimic others.
-    Base and tool of the chain lead to the measuring device and its target, which are not parts of
-    the robot, so the URDF's own transforms before the first axis and behind the last frame are
-    kept. Errors of theta and d go into the origin of their joint; everything behind it follows.
-
-    The chain is the corrected one, identified from this nominal URDF and these links (as for
-    `chain_from_urdf`) or from an equal chain.
-
-    Raises ConfigError if the chain is not of this arm, or has effects beyond these couplings,
-    which a URDF cannot represent.
-    """
-    nominal = chain_from_urdf(text, base_link, tip_link, chain.convention)
-    arm = replace(chain, base=nominal.base, tool=nominal.tool, frames=())
-    _refuse_others(arm, nominal)
-    robot = parse_urdf(text)
-    path = robot.path(base_link, tip_link)
-    poses = robot.poses(path[0].parent)
-    tip = _ends(arm)[-1] @ arm.frame('tool').matrix
-    shifts = dict(zip(arm.joint_names, _on_axes(arm) @ se3.invert(_on_axes(nominal)), strict=True))
-
-    last, end = arm.joint_names[-1], path[-1].child
-    corrected, origins = {path[0].parent: np.eye(4)}, {}
-    for before, joint in zip([None, *path[:-1]], path, strict=True):
-        parent, pose = corrected[joint.parent], poses[joint.child]
-        if joint.moves:
-            pose = shifts[joint.name] @ pose
-        elif before is not None and before.name == last:
-            pose = tip @ se3.invert(poses[end]) @ pose
-        else:
-            pose = parent @ joint.origin
-        corrected[joint.child] = pose
-        origins[joint.name] = se3.invert(parent) @ pose
-    text = edited(text, origins, _multipliers(robot, path, nominal, arm))
-    found = chain_from_urdf(text, base_link, tip_link, arm.convention)
-    if any(abs(found.held[k] - value) > SAME for k, value in arm.held.items()):
-        raise ConfigError(
-            'a joint mimics one that has an offset itself, so the URDF cannot hold the fitted '
-            'couplings: identify with --fixed "*.coupling_*"'
-        )
-    q = arm.random_joints(1000, np.random.default_rng(0))
-    if np.abs(found.forward(q) - arm.forward(q)).max() > SAME:
-        raise ConfigError(
-            f'a, alpha or beta of joint "{last}" changed, and no fixed joint behind it can '
-            'absorb that: let the tool frame be fitted instead, or add a fixed joint and a link'
-        )
-    return text
-
-
-def _multipliers(
-    robot: Description, path: Sequence[DescribedJoint], nominal: Chain, arm: Chain
-) -> dict[str, float]:
-    """Return the multipliers of joints whose fitted couplings are not nominal.
-
-    A coupling to the leader is the product of the multipliers on the way to it.
-    """
-    known, values = dict(nominal.effects), dict(arm.effects)
-    couplings = {joint.name: _coupling(joint) for joint in path if joint.follows}
-    changes = {name: values.get(each, 0.0) / known[each] for name, each in couplings.items()}
-    found = {}
-    for joint in robot.joints:
-        if joint.follows and changes.get(joint.name, 1.0) != 1.0:
-            master, multiplier, _ = joint.follows
-            found[joint.name] = multiplier * changes[joint.name] / changes.get(master, 1.0)
-    return found
-
-
-def _refuse_others(arm: Chain, nominal: Chain) -> None:
-    refuse_other_joints('the chain', arm, 'the URDF, between these links,', nominal)
-    known = dict(nominal.effects)
-    if effects := [name for name, value in arm.effects if value and name not in known]:
-        raise ConfigError(
-            f'a URDF cannot represent the effects {", ".join(effects)}, and the chain is not '
-            'accurate without them: identify with the model "geometric"'
-        )
-    q = nominal.random_joints(50, np.random.default_rng(0))
-    found, expected = arm.forward(q), nominal.forward(q)
-    shift = np.linalg.norm(found[:, :3, 3] - expected[:, :3, 3], axis=1).mean()
-    turns = found[:, :3, :3] @ np.swapaxes(expected[:, :3, :3], 1, 2)
-    turn = np.linalg.norm(se3.log_rotation(turns), axis=1).mean()
-    if max(shift, turn) > MOST_APART:
-        raise ConfigError(
-            f'the chain is not the arm of this URDF between these links: the poses differ by '
-            f'{shift:.3g} m and {turn:.3g} rad on average; identify again with the URDF as chain'
-        )
-
-
-def _coupling(joint: DescribedJoint) -> str:
+def coupling_of(joint: DescribedJoint) -> str:
     """Return the name of the effect that couples a joint to the one that it mimics."""
     return f'{joint.name}.coupling_{joint.follows[0] if joint.follows else ""}'
 
@@ -217,91 +105,6 @@ def _first_frame(joint: FloatArray, axis: FloatArray) -> FloatArray:
     x = across / np.linalg.norm(across)
     foot = joint[:3, 3] - axis * (axis @ joint[:3, 3])
     return se3.transform(np.column_stack([x, np.cross(axis, x), axis]), foot)
-
-
-def with_common_normals(chain: Chain) -> Chain:
-    """Return the same arm without b, and beta only between axes closer than PARALLEL_TOLERANCE."""
-    rows = list(chain.joints)
-    for i in range(len(rows) - 1):
-        k = i if chain.convention == 'standard' else i + 1  # row of the bend
-        bend = rows[k]
-        row = replace(rows[i], a=bend.a, alpha=bend.alpha, beta=bend.beta, b=bend.b)
-        close = row.tilt < np.sin(PARALLEL_TOLERANCE)
-        if not row.b and (close or not row.beta):
-            continue
-        end = _ends(Chain('row', 'standard', (row,)))[0]
-        plain = _row_to_axis(row, np.eye(4), end[:3, 2], end[:3, 3], common_normal=not close)
-        rest = se3.invert(_ends(Chain('row', 'standard', (plain,)))[0]) @ end
-        rows[i] = replace(rows[i], theta=plain.theta, d=plain.d)
-        rows[k] = replace(rows[k], a=plain.a, alpha=plain.alpha, beta=plain.beta, b=0.0)
-        turn = float(np.arctan2(rest[1, 0], rest[0, 0]))
-        later = rows[i + 1]
-        rows[i + 1] = replace(later, theta=later.theta + turn, d=later.d + float(rest[2, 3]))
-    return replace(chain, joints=tuple(rows), parallel=None)
-
-
-def _row_to_axis(
-    row: Joint, frame: FloatArray, axis: FloatArray, point: FloatArray, common_normal: bool = False
-) -> Joint:
-    """Return a standard row that leads from a frame on its axis to the next axis.
-
-    Of the two directions of its x the one within 90 degrees of the frame's is chosen.
-    """
-    z = frame[:3, :3].T @ axis
-    p = frame[:3, :3].T @ (point - frame[:3, 3])
-    tilt = float(np.hypot(z[0], z[1]))
-    x, y = p[:2] - p[2] / (z[2] or 1.0) * z[:2]
-    parallel = not common_normal and nearly_parallel(tilt, float(np.hypot(x, y)))
-    if parallel:
-        d, a = 0.0, float(np.hypot(x, y))
-        theta = float(np.arctan2(y, x)) if _clean(a) else 0.0
-    else:
-        normal = np.array([-z[1], z[0]]) / tilt
-        d, a = float(p[2] - z[2] * (p[:2] @ z[:2]) / tilt**2), float(normal @ p[:2])
-        theta = float(np.arctan2(normal[1], normal[0]))
-    if _clean(np.cos(theta)) < 0.0:
-        theta, a = theta - np.copysign(np.pi, theta), -a
-    theta = _clean_angle(theta)
-    across = np.cos(theta) * z[1] - np.sin(theta) * z[0]
-    along = np.cos(theta) * z[0] + np.sin(theta) * z[1]
-    return replace(
-        row,
-        theta=theta,
-        d=_clean(d),
-        a=_clean(a),
-        alpha=_clean_angle(float(np.arctan2(-across, z[2]))),
-        beta=_clean_angle(float(np.arcsin(along))) if parallel else 0.0,
-        b=0.0,
-    )
-
-
-def _clean(length: float) -> float:
-    """Return a length [m] without the rounding of sums in its last digit."""
-    return round(length, np.finfo(float).precision - 1) + 0.0
-
-
-def _clean_angle(angle: float) -> float:
-    """Return an angle [rad] without rounding; a right angle if that close."""
-    right = round(angle / (np.pi / 2)) * (np.pi / 2)
-    return _clean(angle) if _clean(angle - right) else right
-
-
-def _ends(chain: Chain) -> FloatArray:
-    """Return the frames (n, 4, 4) at the ends of the links at zero."""
-    ends = chain.walk.along(np.zeros((len(chain.joints), 1)), chain.frame('base').matrix)[1]
-    found = ends[..., 0]
-    return se3.transform(np.swapaxes(found[:, :3], 1, 2), found[:, 3])
-
-
-def _on_axes(chain: Chain) -> FloatArray:
-    """Return the frames (n, 4, 4) at zero after theta and d of each row, z along the motion."""
-    frames = _ends(chain)
-    if chain.convention == 'standard':
-        for i, row in enumerate(chain.joints):
-            bend = replace(row, theta=0.0, d=0.0)
-            frames[i] = frames[i] @ se3.invert(_ends(Chain('bend', 'standard', (bend,)))[0])
-    signs = np.array([[1.0, row.sign, row.sign, 1.0] for row in chain.joints])
-    return np.asarray(frames * signs[:, np.newaxis, :])
 
 
 def _with_masses(

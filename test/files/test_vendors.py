@@ -16,8 +16,9 @@ from calib_ros.files.export import ExportError, converted
 from calib_ros.files.vendors import vendor_files
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
-from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
-from calib_ros.kinematics.urdf_tree import parse_urdf
+from calib_ros.kinematics.corrected_urdf import corrected_urdf
+from calib_ros.kinematics.urdf import chain_from_urdf
+from calib_ros.kinematics.urdf_reader import parse_urdf
 
 URS = ('ur5e', 'ur10', 'ur10e')
 FRANKAS = ('franka_panda', 'franka_fr3')

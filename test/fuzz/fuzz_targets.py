@@ -212,7 +212,7 @@ def calibration(path):
 @target('.urdf')
 def urdf(path):
     from calib_ros.kinematics.chain_file import chain_text, read_urdf
-    from calib_ros.kinematics.urdf import corrected_urdf
+    from calib_ros.kinematics.corrected_urdf import corrected_urdf
 
     found = read_urdf(path)
     corrected_urdf(chain_text(path), found.with_offsets({f'{found.joint_names[0]}.theta': 1e-3}))

@@ -16,10 +16,11 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
+from calib_ros.kinematics.corrected_urdf import corrected_urdf
 from calib_ros.kinematics.effects import basis, couple_held
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.joint import Joint
-from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
+from calib_ros.kinematics.urdf import chain_from_urdf
 
 Y = (0, 1, 0)
 NAMES = ('turn', 'lower', 'upper', 'level_1', 'level_2', 'wrist')

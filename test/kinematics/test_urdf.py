@@ -30,9 +30,11 @@ from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.kinematics import effects
+from calib_ros.kinematics.axes import with_common_normals
 from calib_ros.kinematics.chain import PARALLEL_TOLERANCE, Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
-from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf, with_common_normals
+from calib_ros.kinematics.corrected_urdf import corrected_urdf
+from calib_ros.kinematics.urdf import chain_from_urdf
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)

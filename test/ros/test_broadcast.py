@@ -22,7 +22,8 @@ from calib_ros.errors import ConfigError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain
-from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
+from calib_ros.kinematics.corrected_urdf import corrected_urdf
+from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.ros.broadcast import Broadcast
 
 NAMES = {'base_frame': 'base_link', 'flange_frame': 'tool0', 'target_frame': 'ball'}
