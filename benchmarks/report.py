@@ -32,7 +32,8 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.files.loading import Loaded
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report.page import Origin, render
+from calib_ros.report.content import Origin
+from calib_ros.report.page import render
 from calib_ros.report.reports import identification_report
 
 SIZES = (500, 20_000, 500_000)

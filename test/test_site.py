@@ -13,7 +13,7 @@ import yaml
 import calib_ros
 from calib_ros.cli.main import main
 from calib_ros.decision.reasons import Rule
-from calib_ros.report.advice import rules
+from calib_ros.report.refusals import rules
 
 ROOT = Path(__file__).parents[1]
 _SPEC = importlib.util.spec_from_file_location('extract', ROOT / 'examples/tutorials/extract.py')

@@ -31,9 +31,11 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of
 from calib_ros.report import applied, documents, reports, words
-from calib_ros.report.advice import BRINGS, FAR, Advice
-from calib_ros.report.page import Origin, markdown
+from calib_ros.report.advice import BRINGS, FAR
+from calib_ros.report.content import Origin
+from calib_ros.report.markdown import markdown
 from calib_ros.report.poses import poses_of, poses_to_verify
+from calib_ros.report.refusals import Advice
 from calib_ros.sampling.dataset import with_lenses
 from calib_ros.settings import Settings, refuse_larger
 from calib_ros.shown import of_them, rounded

@@ -31,6 +31,7 @@ from calib_ros.identification.age import measured_at
 from calib_ros.identification.calibration import Calibration, load_calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.report import page
+from calib_ros.report.content import Origin, Report
 from calib_ros.sampling.dataset import Dataset
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
@@ -99,19 +100,17 @@ def filing_of(
     return rows.Filing(options.serial, measured_at(sets, changed), content, settings, source)
 
 
-def origin_of(
-    options: argparse.Namespace, inputs: Sequence[Path | None], **more: str
-) -> page.Origin:
+def origin_of(options: argparse.Namespace, inputs: Sequence[Path | None], **more: str) -> Origin:
     """Return the origin of a result: the options, what `more` is known, and the files read."""
     chain = Path(options.chain)
     beside = (vars(options).get(name) for name in ('joints', 'places', 'board', 'intrinsics'))
     read = rows.inputs_of(*inputs, *beside, chain if chain.is_file() else None)
     people = {name: getattr(options, name, '') for name in OF_REPORTS}
-    return page.Origin(read, command=options.typed, **people | more)
+    return Origin(read, command=options.typed, **people | more)
 
 
 def page_of(
-    report: page.Report, screen: Screen, name: str = 'report.html', pdf: bool = False
+    report: Report, screen: Screen, name: str = 'report.html', pdf: bool = False
 ) -> Contents:
     """Return a report as files by name; none if a package is missing, with one warning.
 

@@ -21,8 +21,9 @@ from calib_ros.files.loading import TABLES, load_bag, load_table, table
 from calib_ros.files.unpacked import RECORDED
 from calib_ros.fleet.plant import Robot
 from calib_ros.identification.age import measured_at
+from calib_ros.report.content import Origin
 from calib_ros.report.documents import configuration_yaml
-from calib_ros.report.page import Origin, render
+from calib_ros.report.page import render
 from calib_ros.report.reports import identification_report
 from calib_ros.sampling.session import CalibrationSession
 

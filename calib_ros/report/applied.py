@@ -19,8 +19,8 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, sections
+from calib_ros.report.content import Headline, Origin, Report, Section, section
 from calib_ros.report.explorer import explorer
-from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import Poses, numbers, unit_of
 from calib_ros.report.reports import NOT_YET, bring
 from calib_ros.shown import rounded, sentence

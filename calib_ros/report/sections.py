@@ -17,7 +17,7 @@ from calib_ros.decision.residuals import ErrorFigures
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, words
-from calib_ros.report.page import Origin, Section, section
+from calib_ros.report.content import Origin, Section, section
 from calib_ros.report.poses import Poses
 from calib_ros.shown import rounded
 

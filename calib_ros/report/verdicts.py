@@ -18,8 +18,8 @@ from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import norms
 from calib_ros.report import sections
 from calib_ros.report.advice import SPREAD_OUT
+from calib_ros.report.content import Headline, Origin, Report, Section, section
 from calib_ros.report.explorer import explorer
-from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import Poses
 from calib_ros.report.words import interval_mm, turned_in_words
 from calib_ros.settings import Settings

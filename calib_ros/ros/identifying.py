@@ -284,7 +284,8 @@ def _nearer(result: Identification, since: tuple[Calibration, list[Observations]
 
 
 def _page(given: Snapshot, result: Identification) -> str | None:
-    from calib_ros.report.page import Origin, render
+    from calib_ros.report.content import Origin
+    from calib_ros.report.page import render
     from calib_ros.report.reports import identification_report
 
     journal, serial = given.origin['journal'], given.origin['robot_serial']

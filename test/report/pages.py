@@ -10,7 +10,8 @@ from measured import TEST, TRAIN, UR, measured
 
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.loading import Loaded
-from calib_ros.report.page import Origin, render
+from calib_ros.report.content import Origin
+from calib_ros.report.page import render
 from calib_ros.report.reports import identification_report
 
 

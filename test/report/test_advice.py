@@ -14,7 +14,7 @@ from calib_ros.apply import simulation
 from calib_ros.decision.mistakes import Diagnosis
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.undoing import Suspect
-from calib_ros.report import advice
+from calib_ros.report import advice, refusals
 from calib_ros.report.reports import advice_of
 
 
@@ -51,7 +51,7 @@ def test_no_gain_is_told_by_how_much_was_measured_and_what_is_left():
     refused = [Reason(Rule.GAIN, 'little gain')]
     (few,) = advice.advice(refused, advice.Situation(poses=14, left=2.5, sigma=1e-4))
     assert few.meaning.startswith('Only 14 different poses')
-    assert few.steps == advice.rules()[Rule.CONFIGURATIONS].steps
+    assert few.steps == refusals.rules()[Rule.CONFIGURATIONS].steps
     (enough,) = advice.advice(refused, advice.Situation(poses=50, left=4.62, sigma=1e-4))
     assert 'noise of 0.46 mm in each direction; 0.1 mm is stated' in enough.meaning
 
@@ -60,7 +60,7 @@ def test_outliers_are_to_be_looked_at_if_much_is_left():
     refused = [Reason(Rule.LARGEST_ERROR, 'RMS 12.3 mm remains')]
     (told,) = advice.advice(refused, advice.Situation(outliers=12))
     assert '(12 poses; in the report' in told.steps[0]
-    assert told.steps[1:] == advice.rules()[Rule.LARGEST_ERROR].steps
+    assert told.steps[1:] == refusals.rules()[Rule.LARGEST_ERROR].steps
 
 
 def test_no_rule_is_told_before_its_cause():
@@ -87,8 +87,8 @@ def test_errors_shared_in_succession_ask_for_random_order_first():
     """A good arm seen by a device that drifts was told to look for errors of its gears."""
     here = advice.Situation(poses=40, drifts=True)
     (told,) = advice.advice([Reason(Rule.GAIN, 'little gain')], here)
-    assert told.steps == (advice.DRIFTS, *advice.rules()[Rule.GAIN].steps)
-    assert told.again == advice.rules()[Rule.DRIFT].again
+    assert told.steps == (advice.DRIFTS, *refusals.rules()[Rule.GAIN].steps)
+    assert told.again == refusals.rules()[Rule.DRIFT].again
     rows, share = measured(chain=UR, count=40), np.linspace(0.0, 1.0, 40)[:, np.newaxis]
     moved = replace(rows, positions=rows.positions + share * np.array([1.5e-3, 1e-3, -8e-4]))
     problem = Problem(UR, moved)
@@ -174,4 +174,4 @@ def test_poses_in_one_spot_do_not_show_a_good_arm():
     rows = simulation.measure(UR, joints, rng, 5e-5, 2e-4)
     problem = Problem(UR, rows, sigma_position=1e-4, sigma_orientation=4e-4)
     (told,) = report_of(problem, identify(problem)).advice
-    assert told == replace(advice.GOOD_HERE, refusal=told.refusal)
+    assert told == replace(refusals.GOOD_HERE, refusal=told.refusal)

@@ -20,7 +20,9 @@ from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.report import reports
-from calib_ros.report.page import Origin, markdown, with_code
+from calib_ros.report.content import Origin
+from calib_ros.report.markdown import markdown
+from calib_ros.report.page import with_code
 from calib_ros.report.plots import before_after_png
 from calib_ros.report.reports import identification_report
 from calib_ros.sampling.sample import Sample

@@ -22,11 +22,13 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.files.loading import Loaded
 from calib_ros.files.rows import Input
 from calib_ros.kinematics.chain_file import table_hash
-from calib_ros.report import advice, page
+from calib_ros.report import advice, page, refusals
 from calib_ros.report.applied import plan_report, workspace_report
+from calib_ros.report.content import Headline, Origin
 from calib_ros.report.documents import as_document
 from calib_ros.report.explorer import BANDS, SINGLE, WORST, explorer
-from calib_ros.report.page import Headline, Origin, markdown, render
+from calib_ros.report.markdown import markdown
+from calib_ros.report.page import render
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, poses_of
 from calib_ros.report.reports import identification_report
@@ -203,7 +205,7 @@ def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, sigma, state
     report = report_of(problem, result, tolerance=1e-3)
     told, good = report.verdict, state == 'info'
     assert (told.state, 'tolerance' in told.heading, '0.' in told.gain) == (state, good, good)
-    assert (report.advice[0].meaning == advice.GOOD_ARM.meaning) == good
+    assert (report.advice[0].meaning == refusals.GOOD_ARM.meaning) == good
 
 
 def test_the_verdict_of_an_accepted_result_says_where_it_holds_and_what_is_doubtful(solved):

@@ -20,8 +20,10 @@ from calib_ros.apply.verification import verify
 from calib_ros.files.export import exports
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
+from calib_ros.report.content import Origin
 from calib_ros.report.documents import as_document
-from calib_ros.report.page import Origin, markdown, on_paper, render
+from calib_ros.report.markdown import markdown
+from calib_ros.report.page import on_paper, render
 
 IDENTIFY = ('identify', 'cell.csv', '--chain', 'ur5e')
 

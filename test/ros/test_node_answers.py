@@ -22,7 +22,7 @@ from calib_ros.errors import TooFewObservationsError
 from calib_ros.files.history import History
 from calib_ros.identification.records import nominal_document
 from calib_ros.kinematics.chain_file import calibration_record, dump_chain, load_chain, parse_chain
-from calib_ros.report.advice import rules
+from calib_ros.report.refusals import rules
 from calib_ros.ros.identifying import KEEP, NOT_FILED, ONE_BEFORE
 from calib_ros.ros.inputs import deserialised
 from calib_ros.sampling.batches import Stream, feed
