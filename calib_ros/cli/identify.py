@@ -30,7 +30,7 @@ from calib_ros.identification.recalibration import recalibrate
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of
-from calib_ros.report import applied, documents, reports, words
+from calib_ros.report import documents, reports, update, words
 from calib_ros.report.advice import BRINGS, FAR
 from calib_ros.report.content import Origin
 from calib_ros.report.markdown import markdown
@@ -130,13 +130,13 @@ def _update_files(
     poses = poses_to_verify(arm, sets, found.comparison, loaded.by_line)
     serial = found.calibration.serial_of(str(options.previous))
     origin = inputs.origin_of(options, read, serial=serial)
-    report = applied.update_report(found, poses, origin, loaded.warnings)
+    report = update.update_report(found, poses, origin, loaded.warnings)
     contents |= {'residuals.csv': poses.table(), 'report.md': markdown(report, {})}
     return contents | inputs.page_of(report, screen, pdf=options.pdf)
 
 
 def _show_update(found: Recalibration, screen: Screen) -> None:
-    state, changed, step = applied.update_standing(found)
+    state, changed, step = update.update_standing(found)
     screen.title(state.heading, found.accepted)
     screen.table(
         {
@@ -144,7 +144,7 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
             'new poses': f'{found.after.count}, each judged by the others',
             'position error': words.rms_change((found.before, found.after)),
             '95 % interval': _intervals(found.comparison),
-            'arm known to': applied.known_to(found, '->'),
+            'arm known to': update.known_to(found, '->'),
         }
     )
     for why in state.text:

@@ -25,7 +25,7 @@ from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify
 from calib_ros.report.advice import ENOUGH
-from calib_ros.report.applied import VISIT, plan_report
+from calib_ros.report.plan import VISIT, plan_report
 
 TESTS = 'P1 to P5 of ISO 9283 in a cube of {:.3f} m, in {}; collisions are not checked'
 NOISE = 'device noise: {:g} mm in each direction (--sigma-position)'

@@ -19,8 +19,8 @@ from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.limits import check_limits
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.report.applied import placed_in_words, workspace_report
 from calib_ros.report.markdown import markdown
+from calib_ros.report.workspace import placed_in_words, workspace_report
 from calib_ros.shown import rounded
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')

@@ -23,17 +23,18 @@ from calib_ros.files.loading import Loaded
 from calib_ros.files.rows import Input
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice, page, refusals
-from calib_ros.report.applied import plan_report, workspace_report
 from calib_ros.report.content import Headline, Origin
 from calib_ros.report.documents import as_document
 from calib_ros.report.explorer import BANDS, SINGLE, WORST, explorer
 from calib_ros.report.markdown import markdown
 from calib_ros.report.page import render
+from calib_ros.report.plan import plan_report
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, poses_of
 from calib_ros.report.reports import identification_report
 from calib_ros.report.sections import identity_of
 from calib_ros.report.words import limits_mm, summary
+from calib_ros.report.workspace import workspace_report
 
 HOSTILE = '<script>alert(1)</script>"\'&</script><!--'
 
