@@ -30,7 +30,7 @@ ROS = {'rclpy', 'sensor_msgs', 'tf2_msgs', 'geometry_msgs', 'trajectory_msgs', '
 ONLY = {
     **dict.fromkeys(ROS, ('ros.',)),
     'rosbags': ('files.bags', 'files.stored'),
-    'matplotlib': ('report.plots',),
+    'matplotlib': ('report.plots', 'report.drawing'),
     **dict.fromkeys(('jinja2', 'plotly'), ('report.page',)),
     'weasyprint': ('report.page',),
     'cv2': ('files.detector',),
@@ -143,7 +143,7 @@ def test_no_two_modules_import_each_other():
 def test_the_core_needs_neither_ros_nor_yaml_nor_matplotlib():
     blocked = [*ROS, 'rosbags', 'yaml', 'matplotlib', 'jinja2', 'plotly', 'weasyprint', 'cv2']
     blocked += ['pyarrow', 'fsspec', 'dask', 'distributed', 'rich']
-    apart = ('ros.', 'files.bags', 'report.plots')
+    apart = ('ros.', 'files.bags', 'report.plots', 'report.drawing')
     core = [name for name in MODULES if not name.startswith(apart)]
     lines = ['import sys', *(f'sys.modules[{name!r}] = None' for name in blocked)]
     lines += [f'import calib_ros.{name}' for name in core]

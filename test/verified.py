@@ -11,7 +11,7 @@ from calib_ros.apply import simulation
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
 from calib_ros.report.content import Origin
-from calib_ros.report.poses import poses_to_verify
+from calib_ros.report.gathered import poses_to_verify
 from calib_ros.report.verdicts import each_in_words, likely_rms, remarks, verification_report
 
 

@@ -33,8 +33,8 @@ from calib_ros.progress import share_of
 from calib_ros.report import documents, reports, update, words
 from calib_ros.report.advice import BRINGS, FAR
 from calib_ros.report.content import Origin
+from calib_ros.report.gathered import poses_of, poses_to_verify
 from calib_ros.report.markdown import markdown
-from calib_ros.report.poses import poses_of, poses_to_verify
 from calib_ros.report.refusals import Advice
 from calib_ros.sampling.dataset import with_lenses
 from calib_ros.settings import Settings, refuse_larger

@@ -25,8 +25,8 @@ from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
 from calib_ros.report import verdicts
 from calib_ros.report.documents import verification_document
+from calib_ros.report.gathered import poses_to_verify
 from calib_ros.report.markdown import markdown
-from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.words import rms_change
 from calib_ros.sampling.dataset import dataset_of
 from calib_ros.shown import rounded

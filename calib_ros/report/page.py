@@ -62,7 +62,7 @@ def on_paper(report: Report) -> bytes | None:
         import weasyprint
     except (ImportError, OSError):  # OSError: missing system libraries
         return None
-    from calib_ros.report.plots import drawing
+    from calib_ros.report.drawing import drawing
 
     drawings = {each.name: drawing(each.figure, each.height) for each in report.sections}
     if report.picture:  # as high as wide

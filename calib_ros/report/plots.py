@@ -4,22 +4,17 @@
 
 from __future__ import annotations
 
-import base64
-import html
-from collections.abc import Mapping, Sequence
 from io import BytesIO
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import MultipleLocator
 
 from calib_ros.apply.placement import Placements
 from calib_ros.apply.workspace import Survey, rms_map
 from calib_ros.decision.result import Identification
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.report.drawing import blank_figure, png_of
 from calib_ros.report.figures import AFTER, BEFORE
 from calib_ros.texts import one_line
 
@@ -33,7 +28,7 @@ def before_after_png(result: Identification) -> bytes:
         1e3 * np.linalg.norm(residuals.position[comparison.deciding], axis=1)
         for residuals in (comparison.before, comparison.after)
     )
-    figure = _figure(10.0, 3.8)
+    figure = blank_figure(10.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     for name, errors, colour in (('before', before, BEFORE), ('after', after, AFTER)):
         rms = np.sqrt(np.mean(errors**2))
@@ -51,7 +46,7 @@ def before_after_png(result: Identification) -> bytes:
     right.grid(alpha=0.3)
     judged = 'held-out' if result.validation else 'fitted'
     figure.suptitle(f'{one_line(result.chain.name)}, {judged} {thing}s', parse_math=False)
-    return _png(figure)
+    return png_of(figure)
 
 
 def workspace_png(survey: Survey) -> bytes:
@@ -60,7 +55,7 @@ def workspace_png(survey: Survey) -> bytes:
     x, y, z = survey.positions.T
     low, high = np.quantile(z, [0.4, 0.6])
     level = (low <= z) & (z <= high)
-    figure = _figure(13.0, 4.0 * len(rows))
+    figure = blank_figure(13.0, 4.0 * len(rows))
     grid = figure.subplots(len(rows), 3, squeeze=False)
     for axes, (label, errors) in zip(grid, rows, strict=True):
         axes[0].hist(1e3 * errors, bins=60, color=AFTER, alpha=0.7)
@@ -81,7 +76,7 @@ def workspace_png(survey: Survey) -> bytes:
             mesh = place.pcolormesh(first, second, rms.T, cmap='viridis_r', rasterized=True)
             figure.colorbar(mesh, ax=place, label='RMS [mm]')
             _in_metres(place, *labels)
-    return _png(figure)
+    return png_of(figure)
 
 
 def placements_png(placements: Placements) -> bytes:
@@ -89,7 +84,7 @@ def placements_png(placements: Placements) -> bytes:
     reached = np.flatnonzero(~np.isnan(placements.errors))
     reached = reached[np.argsort(-placements.errors[reached])]  # the least in front
     errors = 1e3 * placements.errors
-    figure = _figure(15.0, 4.5)
+    figure = blank_figure(15.0, 4.5)
     for axes, pair in zip(figure.subplots(1, 3), ((0, 1), (0, 2), (1, 2)), strict=True):
         x, y = placements.positions[:, pair].T
         colours = {'c': errors[reached], 's': 60, 'cmap': 'viridis_r', 'rasterized': True}
@@ -100,7 +95,7 @@ def placements_png(placements: Placements) -> bytes:
             axes.plot(x[k], y[k], shape, color='red', label=label, **look)
         _in_metres(axes, 'xyz'[pair[0]], 'xyz'[pair[1]])
         axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), frameon=False)
-    return _png(figure)
+    return png_of(figure)
 
 
 def _in_metres(axes: Axes, first: str, second: str) -> None:
@@ -125,90 +120,3 @@ def board_pdf(rectangles: FloatArray, size: tuple[float, float], words: str) -> 
     buffer = BytesIO()
     figure.savefig(buffer, format='pdf', metadata={'CreationDate': None})
     return buffer.getvalue()
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout='constrained')
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _png(figure: Figure) -> bytes:
-    image = BytesIO()
-    figure.savefig(image, format='png', dpi=120)
-    return image.getvalue()
-
-
-def drawing(figure: Mapping[str, Any] | None, height: int, width: int = 810) -> str | None:
-    """Return a plotly figure as PNG in base64, sizes in pixels; None for one in space.
-
-    It supports the figures of reports with a PDF: curves, dots with intervals, and heat maps.
-    """
-    data = [] if figure is None else figure['data']
-    if figure is None or any(each['type'] == 'scatter3d' for each in data):
-        return None
-    layout = figure['layout']
-    count = layout.get('grid', {}).get('columns', 1)
-    paper = _figure(width / 90.0, height / 90.0)
-    titles = [each['text'] for each in layout.get('annotations', ())] or ['']
-    panels = paper.subplots(1, count, squeeze=False)[0]
-    for end, title, axes in zip(('', '2'), titles, panels, strict=False):
-        axes.set_title(title)
-        for each in data:
-            if each.get('xaxis', 'x') == f'x{end}':
-                (_draw_colours if each['type'] == 'heatmap' else _draw_curve)(axes, each)
-        _draw_axes(axes, layout[f'xaxis{end}'], layout[f'yaxis{end}'])
-        for line in layout.get('shapes', ()):
-            style = {'color': line['line']['color'], 'linestyle': '--', 'linewidth': 1}
-            axes.axvline(line['x0'], **style)
-        if any(each['type'] == 'scatter' for each in data):
-            axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False)
-    return base64.b64encode(_png(paper)).decode()
-
-
-def _draw_curve(axes: Axes, curve: Mapping[str, Any]) -> None:
-    style = {'dash': '--', 'dot': ':', 'solid': '-'}
-    look = curve.get('line') or curve['marker']
-    line = style[look.get('dash', 'solid')] if 'lines' in curve['mode'] else ''
-    mark = {'diamond': 'D'}.get(curve.get('marker', {}).get('symbol', ''), 'o')
-    error = curve.get('error_x', {}).get('array')
-    marks = {'marker': mark if 'markers' in curve['mode'] else '', 'markersize': 4}
-    shown = {'color': look['color'], 'linestyle': line, 'label': curve['name'], **marks}
-    shown['drawstyle'] = 'steps-post' if look.get('shape') == 'hv' else 'default'
-    axes.errorbar(curve['x'], _plain(curve['y']), xerr=error, **shown)
-
-
-def _draw_colours(axes: Axes, mesh: Mapping[str, Any]) -> None:
-    values = np.array(mesh['z'], dtype=float)
-    colours = 'viridis_r' if mesh['colorscale'] == 'Viridis' else 'RdBu'  # plotly's, reversed
-    x, y = (
-        np.arange(len(each)) if isinstance(each[0], str) else np.array(each)
-        for each in (mesh['x'], mesh['y'])
-    )
-    drawn = axes.pcolormesh(x, y, values, shading='nearest', cmap=colours, rasterized=True)
-    drawn.set_clim(mesh.get('zmin'), mesh.get('zmax'))
-    if mesh.get('showscale', True):
-        bar = mesh['colorbar']
-        ticks, label = bar.get('dtick') and MultipleLocator(bar['dtick']), bar['title']['text']
-        axes.figure.colorbar(drawn, ax=axes.figure.axes, label=label, ticks=ticks)
-    for name, ticks in (('x', mesh['x']), ('y', mesh['y'])):
-        if isinstance(ticks[0], str):
-            turned = {'rotation': 90} if name == 'x' else {}
-            getattr(axes, f'set_{name}ticks')(range(len(ticks)), _plain(ticks), **turned)
-
-
-def _draw_axes(axes: Axes, x: Mapping[str, Any], y: Mapping[str, Any]) -> None:
-    for name, axis in (('x', x), ('y', y)):
-        axes.set(**{f'{name}label': axis.get('title', {}).get('text', '')})
-        if 'range' in axis:
-            axes.set(**{f'{name}lim': axis['range']})
-    axes.tick_params(labelleft=y.get('showticklabels', True))
-    if y.get('autorange') == 'reversed':
-        axes.invert_yaxis()
-
-
-def _plain(names: Sequence[Any]) -> list[Any]:
-    return [
-        html.unescape(x.replace('<br>', '\n')).replace('$', r'\$') if isinstance(x, str) else x
-        for x in names
-    ]

@@ -28,7 +28,8 @@ from calib_ros.report import figures, sections, words
 from calib_ros.report.advice import SPREAD_OUT, Situation, advice
 from calib_ros.report.content import Headline, Origin, Report, Section, section
 from calib_ros.report.explorer import explorer
-from calib_ros.report.poses import Poses, poses_of
+from calib_ros.report.gathered import poses_of
+from calib_ros.report.poses import Poses
 from calib_ros.report.refusals import GOOD_ARM, GOOD_HERE, Advice
 from calib_ros.settings import Settings
 from calib_ros.shown import counted, sentence, some

@@ -15,9 +15,9 @@ from calib_ros.apply.camera import Camera, before_camera, photograph
 from calib_ros.decision.comparison import GroupVerdict, compare
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
+from calib_ros.report.drawing import drawing
 from calib_ros.report.figures import against_noise, cumulated, drives, forest, histogram
-from calib_ros.report.plots import drawing
-from calib_ros.report.poses import poses_to_verify
+from calib_ros.report.gathered import poses_to_verify
 
 UR10E = load_chain('ur10e')
 WAVES = tuple(f'shoulder_lift_joint.{wave}_17' for wave in ('sin', 'cos'))

@@ -25,12 +25,13 @@ from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice, page, refusals
 from calib_ros.report.content import Headline, Origin
 from calib_ros.report.documents import as_document
+from calib_ros.report.drawing import drawing
 from calib_ros.report.explorer import BANDS, SINGLE, WORST, explorer
+from calib_ros.report.gathered import poses_of
 from calib_ros.report.markdown import markdown
 from calib_ros.report.page import render
 from calib_ros.report.plan import plan_report
-from calib_ros.report.plots import drawing
-from calib_ros.report.poses import JUDGED, poses_of
+from calib_ros.report.poses import JUDGED
 from calib_ros.report.reports import identification_report
 from calib_ros.report.sections import identity_of
 from calib_ros.report.words import limits_mm, summary
