@@ -43,9 +43,9 @@ from real_robots import DATA, problem_of
 
 from calib_ros.apply import planning
 from calib_ros.apply.candidates import Visibility, draw_candidates
+from calib_ros.apply.choice import Choice
 from calib_ros.apply.design import Candidates, Design, accuracy, predicted
 from calib_ros.apply.placement import place
-from calib_ros.apply.planning import Choice
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration

@@ -11,6 +11,7 @@ import numpy as np
 
 from calib_ros.apply import planning
 from calib_ros.apply.candidates import Visibility, draw_candidates
+from calib_ros.apply.choice import Choice, fewest
 from calib_ros.apply.design import ASSUMED_TOOL, Design
 from calib_ros.apply.iso_9283 import iso_9283_poses
 from calib_ros.apply.planning import Plan
@@ -25,7 +26,7 @@ from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify
 from calib_ros.report.advice import ENOUGH
-from calib_ros.report.plan import VISIT, plan_report
+from calib_ros.report.plan import VISIT, accuracy_in_words, outlook, plan_report
 
 TESTS = 'P1 to P5 of ISO 9283 in a cube of {:.3f} m, in {}; collisions are not checked'
 NOISE = 'device noise: {:g} mm in each direction (--sigma-position)'
@@ -53,7 +54,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             joints, plan = tests.joints, None
         else:
             joints, remarks, plan = _measurement(options, design, visibility, rng, work)
-    table = [] if plan is None else planning.accuracy_in_words(plan)
+    table = [] if plan is None else accuracy_in_words(plan)
     if plan is not None:
         remarks.append(NOISE.format(1e3 * settings.sigma_position))
         remarks += [WITH_TURNS] if options.measured == 'pose' else []
@@ -110,14 +111,14 @@ def _measurement(
     choice = {'criterion': options.criterion, 'apart': options.apart, 'progress': progress}
     needed = chosen = None
     if options.accuracy is not None:
-        given = planning.Choice(design, candidates, task=task, **choice)
-        fewest = planning.fewest(given, 1e-3 * options.accuracy)
-        needed = len(fewest)
-        chosen = fewest if options.poses in (None, needed) else None
+        given = Choice(design, candidates, task=task, **choice)
+        least = fewest(given, 1e-3 * options.accuracy)
+        needed = len(least)
+        chosen = least if options.poses in (None, needed) else None
     count = options.poses or needed or ENOUGH
     choice |= {'velocities': np.broadcast_to(options.velocity, size), 'chosen': chosen}
     plan = planning.plan(design, candidates, task, count, **choice)
-    remarks = planning.outlook(plan, len(candidates), options.accuracy, needed)
+    remarks = outlook(plan, len(candidates), options.accuracy, needed)
     return plan.joints[plan.visit], remarks, plan
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The page of poses to measure."""
+"""Poses to measure, in words and as a page."""
 
 from __future__ import annotations
 
@@ -104,3 +104,37 @@ def _listed(chain: Chain, joints: FloatArray) -> Section:
             for k, row in enumerate(joints[:200].tolist())
         ),
     )
+
+
+def accuracy_in_words(plan: Plan) -> list[str]:
+    """Return the lines of a table: the expected accuracy by number of poses."""
+    count = len(plan.joints)
+    first = int(np.isfinite(plan.accuracy).sum())
+    shown = np.unique(np.linspace(count - first + 1, count, min(first, 12)).round().astype(int))
+    head = 'predicted RMS position error [mm], from measurement noise alone'
+    lines = [head, ' poses   planned   random']
+    for number in shown.tolist():
+        planned, random = (1e3 * each[number - 1] for each in (plan.accuracy, plan.at_random))
+        by_chance = rounded(random) if np.isfinite(random) else '-'
+        lines.append(f'{number:6} {rounded(planned):>9} {by_chance:>8}')
+    if not first:
+        why = f'too few poses to determine all parameters: at least {plan.least} are needed'
+        lines.append(f'{count:6}         - {why}')
+    return lines
+
+
+def outlook(plan: Plan, candidates: int, wanted_mm: float | None, needed: int | None) -> list[str]:
+    """Return the efficiency of a plan, how many poses are needed, and what it leaves open."""
+    text = f'{len(plan.joints)} of {candidates} candidates'
+    if plan.efficiency is not None:
+        text += f', at least {100.0 * plan.efficiency:.0f} % as good as the best choice'
+    lines = [f'{text}; moves take {plan.travel:.0f} s']
+    if needed is not None:
+        lines.append(f'{needed} poses reach {wanted_mm:g} mm')
+    if plan.lacking:
+        lines.append(
+            f'no choice of these candidates determines {", ".join(plan.lacking)}: move the joints '
+            'further and in more combinations, or fix these parameters. The figures ignore these '
+            'parameters, and hold only where the joints move as in the candidates'
+        )
+    return lines

@@ -29,10 +29,10 @@ from sensor_msgs.msg import JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory
 
 from calib_ros.apply.candidates import draw_candidates
+from calib_ros.apply.choice import Choice
 from calib_ros.apply.compensation import in_words
 from calib_ros.apply.compensator import Compensator
 from calib_ros.apply.design import Design
-from calib_ros.apply.planning import Choice
 from calib_ros.apply.program import compensate_program
 from calib_ros.apply.workspace import survey
 from calib_ros.errors import MOST_ENTRIES, CalibrationError, InputError

@@ -10,6 +10,7 @@ from designs import POSTURE, SIGMAS, arm, design_of, predicted_square, some
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply import planning, simulation
+from calib_ros.apply.choice import Choice
 from calib_ros.apply.design import (
     ASSUMED_TOOL,
     Candidates,
@@ -19,7 +20,7 @@ from calib_ros.apply.design import (
     information_of,
     predicted,
 )
-from calib_ros.apply.planning import Choice
+from calib_ros.apply.worth import Worth
 from calib_ros.errors import InputError
 from calib_ros.estimation.observability import observability
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -151,7 +152,7 @@ def test_indices_are_those_of_the_report(criterion):
     q = some(design.chain, 30)
     space = Candidates(design, q)
     so_far = space.known + information_of(space.rows[:12])
-    worth = planning._Worth(space, criterion, None).of(so_far, space.rows)
+    worth = Worth(space, criterion, None).of(so_far, space.rows)
     rows = design.rows(np.concatenate([q[:12], q[20:21]])).reshape(-1, len(design.names))
     factor = np.linalg.qr(rows, mode='r')
     assert worth[20] == pytest.approx(observability(factor, 13)[criterion], rel=1e-5)

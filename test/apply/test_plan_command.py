@@ -11,7 +11,7 @@ from designs import arm, design_of, some
 
 from calib_ros.apply import simulation
 from calib_ros.apply.candidates import Visibility, draw_candidates
-from calib_ros.apply.planning import Choice
+from calib_ros.apply.choice import Choice
 from calib_ros.cli.screen import Work
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.programs import joints_csv, read_joints

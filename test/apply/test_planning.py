@@ -11,10 +11,10 @@ from robots import DATA, needs_data
 from scipy.spatial.distance import pdist
 
 from calib_ros import Chain, Problem, identify, load_chain, read_table
-from calib_ros.apply import planning
+from calib_ros.apply import choice, planning
 from calib_ros.apply.candidates import visit_order
+from calib_ros.apply.choice import Choice
 from calib_ros.apply.design import Candidates, Design, accuracy
-from calib_ros.apply.planning import Choice
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.observability import observability
 from calib_ros.kinematics.chain import Joint
@@ -190,7 +190,7 @@ def test_so_many_poses_are_needed_and_no_fewer(criterion, wanted):
     """Also of more poses than the parameters that the search begins with."""
     chain = arm()
     design, q, task = design_of(chain), some(chain, 200), some(chain, 100, 2)
-    found = planning.fewest(Choice(design, q, criterion, task), wanted)
+    found = choice.fewest(Choice(design, q, criterion, task), wanted)
 
     def best(count):
         return accuracy(design, q[Choice(design, q, criterion, task).best(count)], task)[-1]
@@ -198,9 +198,9 @@ def test_so_many_poses_are_needed_and_no_fewer(criterion, wanted):
     assert (len(found) > len(design.names)) == (wanted < 1e-4)
     assert accuracy(design, q[found], task)[-1] <= wanted < best(len(found) - 1)
     with pytest.raises(InputError, match='all 200 candidates together'):
-        planning.fewest(Choice(design, q, 'd', task), 1e-6)
+        choice.fewest(Choice(design, q, 'd', task), 1e-6)
     with pytest.raises(InputError, match='give the poses at which'):
-        planning.fewest(Choice(design, q), 1e-3)
+        choice.fewest(Choice(design, q), 1e-3)
 
 
 def travel(q, order, speeds):
