@@ -12,7 +12,8 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
 from calib_ros.report.content import Origin
 from calib_ros.report.gathered import poses_to_verify
-from calib_ros.report.verdicts import each_in_words, likely_rms, remarks, verification_report
+from calib_ros.report.remarks import each_in_words, likely_rms, remarks
+from calib_ros.report.verdicts import verification_report
 
 
 def cell():

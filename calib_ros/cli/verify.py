@@ -23,10 +23,12 @@ from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
-from calib_ros.report import verdicts
 from calib_ros.report.documents import verification_document
 from calib_ros.report.gathered import poses_to_verify
 from calib_ros.report.markdown import markdown
+from calib_ros.report.remarks import each_in_words, likely_rms, not_steps, remarks
+from calib_ros.report.standing import standing
+from calib_ros.report.verdicts import verification_report
 from calib_ros.report.words import rms_change
 from calib_ros.sampling.dataset import dataset_of
 from calib_ros.shown import rounded
@@ -76,7 +78,7 @@ def _verified(
         screen.data(dump_json(verification_document(found)))
     else:
         show(found, screen)
-    passed = verdicts.standing(found)[0].state not in ('bad', 'open')
+    passed = standing(found)[0].state not in ('bad', 'open')
     status = 0 if passed else common.Status.NOT_ACCEPTED
     if options.out is None:
         return status, file
@@ -84,7 +86,7 @@ def _verified(
     with screen.work('writing the report') as work:
         poses = poses_to_verify(found.chain, sets, found.comparison, by_line)
         origin = inputs.origin_of(options, read, serial=serial)
-        report = verdicts.verification_report(arm.chain, found, poses, origin, warnings)
+        report = verification_report(arm.chain, found, poses, origin, warnings)
         contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
         contents['report.md'] = markdown(report, {})
         contents |= inputs.page_of(report, screen, pdf=options.pdf)
@@ -102,7 +104,7 @@ def show(found: Verification, screen: Screen) -> None:
     else:
         limit = f'RMS {rounded(1e3 * found.limit)} mm: at most {ALIKE:g} times the expected error'
         limit += ' (--tolerance MM: your own)'
-    state, steps = verdicts.standing(found)
+    state, steps = standing(found)
     screen.title(state.heading, GOOD_OR_BAD.get(state.state))
     screen.table(
         {
@@ -110,14 +112,14 @@ def show(found: Verification, screen: Screen) -> None:
             'position error': rms_change((before, after)),
             'largest': f'{rounded(before.max_mm)} -> {rounded(after.max_mm)} mm',
             'orientation error': rms_change((before, after), 'mrad') or 'not measured',
-            'poses like these': f'RMS {verdicts.likely_rms(found)}',
+            'poses like these': f'RMS {likely_rms(found)}',
             'tolerance': tolerance,
             'limit': limit,
         }
     )
     if found.each:
-        screen.say('\n'.join(['position error [mm] by pose', *verdicts.each_in_words(found)]))
-    said = verdicts.not_steps(verdicts.remarks(found), steps)
+        screen.say('\n'.join(['position error [mm] by pose', *each_in_words(found)]))
+    said = not_steps(remarks(found), steps)
     screen.reasons += said
     for remark in said:
         screen.bullet(remark)

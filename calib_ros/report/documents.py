@@ -17,7 +17,7 @@ from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.report import words
-from calib_ros.report.verdicts import remarks
+from calib_ros.report.remarks import remarks
 from calib_ros.settings import Settings
 from calib_ros.texts import dump_yaml
 

@@ -22,7 +22,8 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.joint import Joint
 from calib_ros.kinematics.se3 import invert
-from calib_ros.report.verdicts import _by_configuration, standing
+from calib_ros.report.standing import standing
+from calib_ros.report.verdicts import _by_configuration
 from calib_ros.shown import rounded
 
 _UNIT = ['(mean', '+', '3', 'std)']

@@ -18,7 +18,8 @@ from calib_ros.cli.common import Status
 from calib_ros.files.programs import joints_csv, read_joints
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
-from calib_ros.report.verdicts import remarks, standing
+from calib_ros.report.remarks import remarks
+from calib_ros.report.standing import standing
 
 
 @pytest.fixture

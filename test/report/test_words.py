@@ -27,7 +27,7 @@ from calib_ros.kinematics.parameter import Parameter
 from calib_ros.report import words
 from calib_ros.report.advice import FAR, SPREAD_OUT
 from calib_ros.report.reports import CLOSER, may_be_closer
-from calib_ros.report.verdicts import standing
+from calib_ros.report.standing import standing
 from calib_ros.report.words import rms_range_mm, still_holds, verdict_in_words
 from calib_ros.shown import rounded, sentence
 
