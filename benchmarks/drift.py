@@ -26,7 +26,8 @@ from scipy.signal import lfilter
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.problem import Problem
-from calib_ros.identification.identification import identify, identify_model
+from calib_ros.identification.identification import identify
+from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics.chain_file import load_chain
 
 NOISE = {'sigma_position': 5e-5, 'sigma_orientation': 2e-4}

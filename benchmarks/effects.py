@@ -22,7 +22,7 @@ import numpy as np
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.identification.identification import identify_model
+from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics import effects
 
 ROBOTS = ('ur10', 'staubli_tx90l', 'kuka_iiwa14')

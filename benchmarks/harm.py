@@ -47,7 +47,8 @@ from harm_designs import DESIGNS, GOOD, session
 from calib_ros.apply.compensation import compensate
 from calib_ros.apply.compensator import Compensator
 from calib_ros.errors import CalibrationError
-from calib_ros.identification.identification import identify, identify_model
+from calib_ros.identification.identification import identify
+from calib_ros.identification.model_choice import identify_model
 
 FLOOR = 1e-5
 """Errors [m] below which nothing is harm."""

@@ -30,7 +30,8 @@ from scipy import linalg
 from scipy.spatial.distance import cdist
 
 from calib_ros.files.tables import read_table
-from calib_ros.identification.identification import identify, identify_model
+from calib_ros.identification.identification import identify
+from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain_file import load_chain
 

@@ -20,10 +20,8 @@ from calib_ros.identification.calibration import (
     load_calibration as load_calibration,
 )
 from calib_ros.identification.difference import Difference as Difference, difference as difference
-from calib_ros.identification.identification import (
-    identify as identify,
-    identify_model as identify_model,
-)
+from calib_ros.identification.identification import identify as identify
+from calib_ros.identification.model_choice import identify_model as identify_model
 from calib_ros.identification.recalibrated import Recalibration as Recalibration
 from calib_ros.identification.recalibration import recalibrate as recalibrate
 from calib_ros.kinematics.chain import Chain as Chain

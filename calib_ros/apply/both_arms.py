@@ -22,7 +22,8 @@ from scipy.spatial import cKDTree
 
 from calib_ros.apply.compensator import Compensator
 from calib_ros.apply.confidence import moments_of, rms_of
-from calib_ros.decision.comparison import Comparison, along_base, axes_of, by_axes, compare
+from calib_ros.decision.comparison import Comparison, along_base, compare
+from calib_ros.decision.residuals import axes_of, by_axes
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
@@ -30,8 +31,9 @@ from calib_ros.estimation.samples import residual_arrays
 from calib_ros.estimation.start import in_new_frames, released
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain, Frame
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.effects import coupled
+from calib_ros.kinematics.joint import Frame
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray, Index
 

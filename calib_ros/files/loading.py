@@ -18,7 +18,7 @@ from calib_ros.files.foreign import Foreign
 from calib_ros.files.journal import refuse_other_joints_than
 from calib_ros.files.layouts import Layout
 from calib_ros.files.tables import read_table
-from calib_ros.identification.identification import identify_model
+from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.records import Owner
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Notify, quiet

@@ -44,6 +44,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import released
 from calib_ros.identification import records
 from calib_ros.identification.age import recorded_time
+from calib_ros.identification.fingerprint import Fingerprint
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.kinematics.chain_file import (
@@ -87,7 +88,7 @@ class Calibration(Shown):
     """Session, device or target of each frame (`sampling.sample.Frames`)."""
     record: Mapping[str, Any] = field(default_factory=dict)
     """Origin of the numbers, as in the file, without covariance and rows."""
-    rows: records.Fingerprint | None = None
+    rows: Fingerprint | None = None
     """Of the fitted measurements."""
 
     @classmethod
@@ -135,7 +136,7 @@ class Calibration(Shown):
             world_frame=result.world_frame,
             owners=owners,
             record=record,
-            rows=records.Fingerprint.of(fitted) if fitted else None,
+            rows=Fingerprint.of(fitted) if fitted else None,
         )
 
     def dump(self) -> str:
@@ -395,5 +396,5 @@ def parse_calibration(
         world_frame=content.get('world_frame', ''),
         owners=record.owners(),
         record={key: value for key, value in content.items() if key not in ('covariance', 'rows')},
-        rows=records.Fingerprint.of_record(content, where),
+        rows=Fingerprint.of_record(content, where),
     )

@@ -16,7 +16,7 @@ from calib_ros.decision.moved import Step
 from calib_ros.decision.residuals import ErrorFigures
 from calib_ros.estimation.levels import ALIKE, CLEARLY
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.records import reused_in_words
+from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.settings import Settings

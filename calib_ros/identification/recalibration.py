@@ -42,8 +42,8 @@ from calib_ros.estimation.system import System
 from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.age import drift_of, recorded_time
 from calib_ros.identification.calibration import Calibration, about, provenance
+from calib_ros.identification.fingerprint import Fingerprint
 from calib_ros.identification.recalibrated import Recalibration
-from calib_ros.identification.records import Fingerprint
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of

@@ -1,28 +1,21 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The record of a calibration: the key `calibration` of a chain file.
-
-A few hundred numbers in it identify the fitted measurements. Each row has a hash; the smallest
-`KEPT` hashes are a random sample of the rows. A further row with a hash up to the largest kept one
-is either among them or was not fitted (Broder 1997). Of updates, by a few rows each, the latest
-rows are kept too: a sample of many others may have none of them.
-"""
+"""The record of a calibration: the key `calibration` of a chain file."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.decision.matrices import damage_error, parse_rows, unpacked_matrix
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.noise import Noise
-from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.start import fit_to_arm, movable
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import (
@@ -42,12 +35,6 @@ Owner: TypeAlias = tuple[str, bool, bool, str]
 OWNER = ('session', 'eye_in_hand', 'socket', 'label')
 ALWAYS = ('table_sha256', 'nominal', 'region')
 """Keys of every record that calib_ros writes; others come before, the first of these is last."""
-Hashes: TypeAlias = NDArray[np.uint64]
-KEPT = 256
-"""Of 1,000 rows fitted, 12 repeated ones are detected in 95 % of cases: one in four is kept.
-Part of the file format, as GRID."""
-GRID = 1.618e-6
-"""Cell size [rad, m or px] of equal values; no decimal number is near an edge."""
 
 
 def nominal_document(nominal: Chain) -> dict[str, Any]:
@@ -265,85 +252,3 @@ def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> str
     far = [n for n, most in limits.items() if abs(chain.value(n) - nominal.value(n)) > most]
     beyond = 'too far from it (largest_length, largest_angle): '
     return f'{beyond}{", ".join(some(far))}' * bool(far)
-
-
-def hashes(sets: Sequence[Observations]) -> Hashes:
-    """Return a hash (N,) of the joint values and the measurement of each row."""
-    found = [np.zeros(0, dtype=np.uint64)]
-    for each in sets:
-        measured = each.given if each.seen else each.positions
-        if each.pixels is not None:
-            measured = np.concatenate([each.pixels, each.points], axis=1)
-        elif each.distances is not None:
-            measured = each.distances[:, np.newaxis]
-        mixed = np.zeros(len(each), dtype=np.uint64)
-        for column in (*each.joints.T, *measured.T):  # Fibonacci hashing, folded
-            cells = np.round(column / GRID).astype(np.int64).view(np.uint64)
-            mixed = (mixed ^ cells) * np.uint64(0x9E3779B97F4A7C15)
-            mixed ^= mixed >> np.uint64(29)
-        found.append(mixed)
-    return np.concatenate(found)
-
-
-@dataclass(frozen=True, eq=False)
-class Fingerprint:
-    """The smallest hashes of `count` rows, ascending, and the `latest` of later fits."""
-
-    count: int
-    least: Hashes
-    latest: Hashes = field(default_factory=lambda: np.zeros(0, dtype=np.uint64))
-
-    @classmethod
-    def of(cls, sets: Sequence[Observations], earlier: Fingerprint | None = None) -> Fingerprint:
-        """Return the fingerprint of rows and of those fitted earlier."""
-        new = hashes(sets)
-        if earlier is None:
-            least, _ = np.unique(new, return_index=True)  # sorts, which is faster than hashing
-            return cls(len(new), least[:KEPT])
-        both = np.union1d(earlier.least, earlier.comparable(new))[:KEPT]
-        latest = np.concatenate([new, earlier.latest])[:KEPT]
-        return cls(earlier.count + len(new), both, latest)
-
-    def comparable(self, rows: Hashes) -> Hashes:
-        """Return which hashes of rows (N,) would be among the smallest if the rows were fitted."""
-        every = self.count <= len(self.least)
-        return rows if every else rows[rows <= self.least.max(initial=0)]
-
-    @classmethod
-    def of_record(cls, record: Mapping[str, Any], where: str) -> Fingerprint | None:
-        """Return the fingerprint in the record of a calibration, if any."""
-        if 'rows' not in record:
-            return None
-        try:
-            known = {'latest': '', **record['rows']}
-            least, latest = (
-                np.frombuffer(bytes.fromhex(known[key]), '>u8').astype(np.uint64)
-                for key in ('least', 'latest')
-            )
-            return cls(int(known['count']), least, latest)
-        except (KeyError, TypeError, ValueError) as err:
-            raise ConfigError(f'{where}: calibration.rows is damaged: identify again') from err
-
-    def document(self) -> dict[str, Any]:
-        """Return the fingerprint for the record."""
-        kept = {'least': self.least, 'latest': self.latest}
-        texts = {key: each.astype('>u8').tobytes().hex() for key, each in kept.items()}
-        return {'count': self.count, **texts}
-
-    def share(self, sets: Sequence[Observations]) -> float:
-        """Return the estimated share of rows that were fitted."""
-        rows = hashes(sets)
-        sample = self.comparable(rows)
-        pairs = (sample, self.least), (rows, self.latest)
-        return max(float(np.isin(own, kept).mean()) if own.size else 0.0 for own, kept in pairs)
-
-
-def reused_in_words(share: float) -> str:
-    """Return a warning about the share of measurements already fitted; empty for none."""
-    if not share:
-        return ''
-    which = 'these' if share > 0.995 else f'{100.0 * share:.0f} % of these'
-    return (
-        f'the calibration was fitted to {which} measurements, so they prove nothing about other '
-        'poses'
-    )

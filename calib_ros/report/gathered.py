@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.decision.comparison import Comparison, axes_of, by_axes
+from calib_ros.decision.comparison import Comparison
+from calib_ros.decision.residuals import axes_of, by_axes
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.observations import Observations

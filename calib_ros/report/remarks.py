@@ -11,7 +11,7 @@ import numpy as np
 from calib_ros.apply.judgement import DECIDING
 from calib_ros.apply.verified import Verification
 from calib_ros.estimation.levels import NEARER
-from calib_ros.identification.records import reused_in_words
+from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.kinematics.se3 import norms
 from calib_ros.report.words import interval_mm, turned_in_words
 from calib_ros.settings import Settings

@@ -17,8 +17,8 @@ from calib_ros.decision.residuals import ErrorFigures
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.noise import Noise
+from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.identification.recalibrated import Recalibration
-from calib_ros.identification.records import reused_in_words
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter

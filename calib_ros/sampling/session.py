@@ -17,7 +17,7 @@ from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.identification import identify_model
+from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.account import Account, Cause
 from calib_ros.sampling.dataset import Dataset, check_settings, collect, dataset_of

@@ -19,7 +19,8 @@ from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import start_frames
 from calib_ros.estimation.system import Prior
-from calib_ros.identification.identification import identify, identify_model
+from calib_ros.identification.identification import identify
+from calib_ros.identification.model_choice import identify_model
 from calib_ros.report.documents import as_document
 from calib_ros.report.words import chance_in_words
 

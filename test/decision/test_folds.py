@@ -17,7 +17,8 @@ from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.system import row_samples, stacked
 from calib_ros.identification import identification
-from calib_ros.identification.identification import identify, identify_model
+from calib_ros.identification.identification import identify
+from calib_ros.identification.model_choice import identify_model
 
 pytestmark = pytest.mark.usefixtures('unsearched')
 

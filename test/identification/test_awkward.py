@@ -19,7 +19,7 @@ from calib_ros.errors import TooFewObservationsError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.identification import identify_model
+from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.documents import as_document

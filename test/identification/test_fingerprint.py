@@ -7,7 +7,7 @@ import pytest
 
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.observations import Observations
-from calib_ros.identification.records import KEPT, Fingerprint, hashes, reused_in_words
+from calib_ros.identification.fingerprint import KEPT, Fingerprint, hashes, reused_in_words
 
 
 def rows(count, seed=0):

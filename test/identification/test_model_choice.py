@@ -12,9 +12,10 @@ from calib_ros.decision.comparison import GroupVerdict
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.identification import identification
-from calib_ros.identification.identification import identify, identify_model
+from calib_ros.identification import model_choice
+from calib_ros.identification.identification import identify
 from calib_ros.identification.linear_model import LinearModel
+from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.effects import group_of
 from calib_ros.kinematics.parameter import Parameter
@@ -271,7 +272,7 @@ def test_all_harmonics_are_tried_after_a_few_or_where_one_does_not_pay(
     found, everything, gains, tried, chosen
 ):
     model, verdicts, names = Told(found, everything, gains), {}, ['b.ratio']
-    more = identification._choose_harmonics(model, names, verdicts, lambda _: None)
+    more = model_choice._choose_harmonics(model, names, verdicts, lambda _: None)
     assert more is bool(chosen)
     assert ''.join('*' if what == 'all' else what[3] for _, what in model.tried) == tried
     assert names == ['b.ratio', *(f'a.{wave}_{k}' for k in chosen for wave in ('sin', 'cos'))]
@@ -285,8 +286,8 @@ def choice(monkeypatch):
     """Return what is chosen with a linear model, and the verdicts."""
 
     def chosen(model):
-        monkeypatch.setattr(identification, 'LinearModel', lambda *_: model)
-        found = identification._choose_effects(SimpleNamespace(chain=UR10E), None, lambda _: None)
+        monkeypatch.setattr(model_choice, 'LinearModel', lambda *_: model)
+        found = model_choice._choose_effects(SimpleNamespace(chain=UR10E), None, lambda _: None)
         return found[0], {verdict.what: verdict.pays for verdict in found[1]}
 
     return chosen
@@ -372,10 +373,10 @@ def test_a_richer_model_is_used_unless_it_is_worse(before, richer, reason, monke
         progress(0.25)
         return ('elbow_joint.ratio',), verdicts
 
-    monkeypatch.setattr(identification, 'identify', identified)
-    monkeypatch.setattr(identification, '_choose_effects', lambda *_: ((), verdicts))
+    monkeypatch.setattr(model_choice, 'identify', identified)
+    monkeypatch.setattr(model_choice, '_choose_effects', lambda *_: ((), verdicts))
     assert identify_model(problem, 'auto') == replace(before, verdicts=verdicts)
-    monkeypatch.setattr(identification, '_choose_effects', chosen)
+    monkeypatch.setattr(model_choice, '_choose_effects', chosen)
     found = identify_model(problem, 'auto', lambda told: shares.append(told))
     assert found.richer is (reason is None)
     assert found.verdicts == verdicts
