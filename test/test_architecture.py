@@ -10,6 +10,7 @@ from collections import Counter
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
+from statistics import median
 
 import pytest
 
@@ -103,6 +104,10 @@ def test_modules_and_functions_are_small(module):
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef):
             assert node.end_lineno - node.lineno < 60, node.name
+
+
+def test_half_of_the_modules_are_read_at_a_glance():
+    assert median(path.read_text().count('\n') for path in MODULES.values()) <= 150
 
 
 def test_few_numbers_are_tuned():
