@@ -5,28 +5,25 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from scipy import special
 
-from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import Fitted
-from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.gain import gain_share
 from calib_ros.estimation.gross_errors import SUSPICIOUS
-from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING, chance_of
+from calib_ros.estimation.levels import NEARER, SURE, TELLING
 from calib_ros.estimation.observations import Observations, numbered
-from calib_ros.estimation.problem import Learned, Problem
+from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.system import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray, norms
+from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXCEPTION
 
 ADVICE = (
@@ -126,77 +123,3 @@ def explained_share(
     few = [each.spread() for each in problem.sets]
     rows = problem.system(few).rows_of(chain, (*fitted, *added))
     return gain_share(stacked(rows), len(fitted))
-
-
-def zero_of_distances(fitted: Fitted) -> tuple[Reason, ...]:
-    """Return by how much the distances of devices are too long, if that explains a misfit.
-
-    The zeros of draw-wires, found by refits. A scale is no rival: the arm's lengths imitate it.
-    """
-    problem, sets = fitted.problem, fitted.problem.sets
-    wires = [*dict.fromkeys(e.base for e in sets if e.distances is not None and not e.plane)]
-    found = np.zeros(len(wires))
-    for _ in range(SEVERAL if wires else 0):
-        if not (more := _constants(fitted, wires)).any():
-            break
-        found += more
-        shorter = dict(zip(wires, -found, strict=True))
-        fitted = fit(problem.with_sets(_lengthened(sets, shorter)))
-    if not found.any():
-        return ()
-    if len(wires) > 1:
-        each = (f'{wire} {1e3 * off:.3g} mm' for wire, off in zip(wires, found, strict=True))
-        what = f'distances are too long by the zeros of their devices ({", ".join(each)})'
-        return (Reason(Rule.MISTAKE, f'{what}: subtract these'),)
-    (off,) = found.tolist()
-    remedy = 'correct the zero where they are published'
-    if not problem.of_messages:
-        remedy = f'--columns distance=distance{-off:+.5f} (if in metres)'
-    way = 'long' if off > 0.0 else 'short'
-    what = f'all distances are {1e3 * abs(off):.3g} mm too {way}, by the zero'
-    return (Reason(Rule.MISTAKE, f'{what}: {remedy}'),)
-
-
-def _constants(fitted: Fitted, wires: Sequence[str]) -> FloatArray:
-    """Return the constants (K,) [m] in the distances of devices that explain a misfit, or zeros.
-
-    Nor must a usual sag of the arm explain as much, or another place of frames that are held.
-    """
-    problem, pairs = fitted.problem, zip(fitted.problem.sets, fitted.robust.inliers, strict=True)
-    sets = [each.select(good) for each, good in pairs]
-    ends = [end for each in sets if each.base in wires for end in (each.base, each.tool)]
-    placed = [name for end in ends for name in parameters_of(end)[:3]]
-    names = list(dict.fromkeys([*fitted.names, *placed]))
-    sags = [n for n in effects.members(problem.chain, 'gravity') if n not in names]
-    sane = {n: problem.common_sense(n) for n in names if not problem.model.owns_frame(n)}
-    system = replace(problem, learned=Learned(sane)).system(sets)
-    chain, count = fitted.chain.with_effects(sags), len(names)
-    rows = stacked(system.rows_of(chain, [*names, *sags]))
-    given, back = system.extra_rows(chain, [*names, *sags])
-    usual = np.diag([0.0] * count + [1.0 / effects.expected(name) for name in sags])
-    bent = np.concatenate([rows[:, :-1], given, usual])
-    wanted = np.concatenate([rows[:, -1], back, np.zeros(len(usual))])
-    zeros = np.zeros((len(wanted), len(wires)))
-    for k, wire in enumerate(wires):
-        longer = problem.system(_lengthened(sets, {wire: 1.0})).rows_of(chain, ())
-        zeros[: len(rows), k] = stacked(longer)[:, 0] - rows[:, -1]
-    tried = (bent, np.column_stack([bent[:, :count], zeros]))
-    found = [np.linalg.lstsq(each, wanted)[0] for each in tried]
-    most, left = (
-        float(np.sum((wanted - each @ by) ** 2)) for each, by in zip(tried, found, strict=True)
-    )
-    free = len(rows) - count - len(wires)
-    if free <= 0 or most <= ALIKE**2 * left:
-        return np.zeros(len(wires))
-    chance = chance_of((most - left) * free / max(left, ROUNDING), len(wires), free)
-    return found[1][count:] if chance < 1.0 - SURE else np.zeros(len(wires))
-
-
-def _lengthened(sets: Sequence[Observations], more: Mapping[str, float]) -> list[Observations]:
-    """Return sets with the distances of some devices longer [m]."""
-    return [
-        each
-        if each.distances is None or each.base not in more
-        else replace(each, distances=each.distances + more[each.base])
-        for each in sets
-    ]

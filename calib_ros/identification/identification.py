@@ -20,13 +20,14 @@ from calib_ros.decision import mistakes, plausibility
 from calib_ros.decision.acceptance import oddities, refusals
 from calib_ros.decision.comparison import compare
 from calib_ros.decision.drift import chance_of_gain
-from calib_ros.decision.misfits import arms_own, coupling_share, outliers_of, zero_of_distances
+from calib_ros.decision.misfits import arms_own, coupling_share, outliers_of
 from calib_ros.decision.region import Region
 from calib_ros.decision.result import Identification
 from calib_ros.decision.risk import region_of
 from calib_ros.decision.rounding import may_be_rounding, rounded_joints, rounding_errors
 from calib_ros.decision.steps import find_step
 from calib_ros.decision.validation import held_out_excess, validate
+from calib_ros.decision.wires import wrong_distances
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.considered import considered
@@ -98,7 +99,7 @@ def _identified(
     uncertainty = replace(uncertainty, parts=wider**2 * uncertainty.parts)
     parameters = parameter_rows(fitted, uncertainty)
     region, scaled = _region(inference, posterior, wider)
-    step = None if (wrong := zero_of_distances(fitted)) else find_step(fitted)
+    step = None if (wrong := wrong_distances(fitted)) else find_step(fitted)
     result = Identification(
         chain=chain,
         before=before.chain,

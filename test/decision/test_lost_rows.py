@@ -8,18 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fits import NOISE, UR10E, arm, measured_arm
-from in_sockets import cell
 from scipy.spatial.transform import Rotation
 
 from calib_ros import Problem, identify
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import measure
 from calib_ros.decision import lost_rows
 from calib_ros.decision.lost_rows import _sides_differ, _where, row_loss
-from calib_ros.decision.misfits import zero_of_distances
 from calib_ros.decision.mistakes import diagnose
-from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.levels import LEAST_ASIDE
-from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 
 
@@ -222,65 +218,6 @@ def test_euler_angles_about_fixed_axes_in_the_order_of_their_columns_are_named()
     wrong = Rotation.from_euler('ZYX', angles).as_matrix()
     (found,) = diagnose(Problem(UR10E, replace(seen, rotations=wrong))).suspects
     assert 'reverse the letters of --euler' in found.remedy
-
-
-@pytest.mark.parametrize('effects', [(), ('gravity',)])
-@pytest.mark.parametrize('zero', [0.0, 0.005, 0.1, -0.1])
-def test_the_zero_of_a_draw_wire_is_named(zero, effects):
-    """5 mm of it were accepted, and left the arm 0.8 mm off."""
-    *_, seen = measured_arm(21, 80, (3e-5, 0.0), oriented=False)
-    lengths = np.linalg.norm(seen.positions, axis=1) + zero
-    result = identify(Problem(UR10E, replace(seen, distances=lengths), effects=effects))
-    way = 'long' if zero > 0.0 else 'short'
-    found = re.search(rf'distances are (\S+) mm too {way}', ' '.join(map(str, result.refusals)))
-    assert (found is not None) is bool(zero)
-    assert not zero or float(found[1]) == pytest.approx(1e3 * abs(zero), abs=0.5)
-
-
-@pytest.mark.parametrize('seed', [112, 127, 177])
-def test_a_sag_that_looks_like_the_zero_of_a_draw_wire_is_not_taken_for_it(seed):
-    tx90 = load_chain('staubli_tx90l')
-    rng, names = np.random.default_rng(seed), tx90.joint_names
-    bends = dict.fromkeys([f'{names[1]}.gravity_{names[k]}' for k in (2, 5)], 3e-4)
-    bends[f'{names[2]}.gravity_{names[4]}'] = 3e-4
-    true = faulty(tx90, Cell(), rng).with_effect_values(bends)
-    seen = measure(true, tx90.random_joints(60, rng), rng, 3e-5, oriented=False)
-    lengths = np.linalg.norm(seen.positions, axis=1)
-    assert not zero_of_distances(fit(Problem(tx90, replace(seen, distances=lengths))))
-
-
-def test_the_zeros_of_several_draw_wires_are_named_together():
-    """Four of eight such sessions were accepted, with errors of 0.3 to 2 mm."""
-    rng, true, first = measured_arm(21, 50, (3e-5, 0.0), oriented=False)
-    second = measure(true, UR10E.random_joints(50, rng), rng, 3e-5, oriented=False)
-    wires = []
-    for seen, anchor, zero in ((first, 0.0, 0.005), (second, 0.7, -0.008)):
-        lengths = np.linalg.norm(seen.positions - anchor, axis=1) + zero
-        wires.append(replace(seen, distances=lengths, base=f'base_{anchor:.0f}'))
-    result = identify(Problem(UR10E, wires[0], more=wires[1:]))
-    found = re.findall(r'base_\d (\S+) mm', result.refusals[0])
-    np.testing.assert_allclose([float(each) for each in found], [5.0, -8.0], atol=0.5)
-    assert result.step is None
-
-
-def test_a_base_that_is_held_off_is_not_the_zero_of_a_draw_wire():
-    *_, seen = measured_arm(22, 60, (3e-5, 0.0), oriented=False)
-    lengths = np.linalg.norm(seen.positions, axis=1)
-    free = fit(Problem(UR10E, replace(seen, distances=lengths))).chain.base
-    off = free.matrix.copy()
-    off[:3, 3] += [0.002, -0.002, 0.002]
-    held = replace(UR10E, base=Frame(off, fixed=True))
-    assert not zero_of_distances(fit(Problem(held, replace(seen, distances=lengths))))
-
-
-def test_few_distances_beside_sockets_tell_no_zero():
-    """A constant and an anchor explain four, and an arm that shrinks to nothing all sockets."""
-    true, problem = cell(3, noise=3e-5, count=4)
-    rng = np.random.default_rng(1)
-    seen = measure(true, true.random_joints(4, rng), rng, 1e-4, oriented=False)
-    lengths = np.linalg.norm(seen.positions - [1.2, 0.6, 0.3], axis=1)
-    wire = replace(seen, distances=lengths, base='base_wire')
-    assert not zero_of_distances(fit(replace(problem, more=[*problem.more, wire])))
 
 
 def test_gross_errors_at_poses_measured_again_and_again_are_no_repeated_joint_values():
