@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.observations import Observations
@@ -15,7 +16,7 @@ ZERO = 'zero'  # of the distances of a device
 FRAMES = ('base', 'tool')
 IN_THE_CELL = (*FRAMES, ZERO)  # beside the arm
 ZEROS = ('joint', ZERO)
-FROM_THERE = 'from there on'
+FROM_THERE, BEFORE = 'from there on', 'before that'
 OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
 
 
@@ -49,6 +50,8 @@ class Step:
     """Whether a frame that the chain file holds is wrong from the first pose on."""
     slow: bool = False
     """Whether it crept over the whole session."""
+    longer: Mapping[str, float] = field(default_factory=dict)
+    """By how much [m] the distances of devices are longer from there on, if their zeros moved."""
 
     @property
     def harmful(self) -> bool:
@@ -66,6 +69,16 @@ class Step:
     @property
     def _size(self) -> str:
         return f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
+
+    @property
+    def _correction(self) -> str:
+        """Return how to make distances before and after alike."""
+        after, parts = self.unused != BEFORE, []
+        for wire, longer in self.longer.items():
+            less = (longer > 0.0) == after
+            how = ('subtract', 'from') if less else ('add', 'to')
+            parts.append(f'{how[0]} {1e3 * abs(longer):.3g} mm {how[1]} the distances of {wire}')
+        return f'{" and ".join(parts)} {FROM_THERE if after else BEFORE}'
 
     def told(self, number: int) -> str:
         """Return what moved in short, for an operator of the node who counts poses so."""
@@ -99,6 +112,8 @@ class Step:
         if self.unused:
             more += f'; measurements {self.unused} carry no weight'
             more += f': {self.what} is outdated, measure again' * self.outdated
+        if self.longer and not self.slow:
+            more += f'; {self._correction}'
         if self.apart:
             more += (
                 '; errors of the arm may look so, as poses before and after lie apart: mix them'

@@ -24,7 +24,16 @@ import numpy as np
 from calib_ros.decision.drift import slow_cosines
 from calib_ros.decision.imitations import LEAST, Imitation
 from calib_ros.decision.movable import Moving, groups_of, of_the_arm
-from calib_ros.decision.moved import FROM_THERE, IN_THE_CELL, ZERO, ZEROS, Step, place_of, thing_of
+from calib_ros.decision.moved import (
+    BEFORE,
+    FROM_THERE,
+    IN_THE_CELL,
+    ZERO,
+    ZEROS,
+    Step,
+    place_of,
+    thing_of,
+)
 from calib_ros.decision.trials import largest_of
 from calib_ros.estimation.configurations import stops
 from calib_ros.estimation.fitted import Fitted
@@ -332,13 +341,19 @@ class _Scan:
         change = np.sqrt(((np.concatenate(moved) @ found.size[known]) ** 2).mean(axis=0))
         size, turn = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
         unit, oriented = 'm', any(each.turned for each in problem.sets)
+        longer = {}
+        if group.kind == ZERO:
+            longer = {
+                Parameter(name).owner: float(s)
+                for name, s in zip(group.names, found.size, strict=True)
+            }
         if group.kind in ZEROS:
             size, unit = float(np.abs(found.size).max()), Parameter(group.names[0]).unit
         elif oriented and turn * problem.sigma_position > size * problem.sigma_orientation:
             size, unit = turn, 'rad'
         weights = np.concatenate([self._weights[k] for k in group.sets])
         later = np.concatenate(after)
-        sides = ('before that', ~later), (FROM_THERE, later)
+        sides = (BEFORE, ~later), (FROM_THERE, later)
         most = largest_of(problem) if unit == 'm' else problem.largest_angle
         joints = np.concatenate([each.joints for each in sets])
         unused = [where for where, side in sides if found.stop and not weights[side].any()]
@@ -358,6 +373,7 @@ class _Scan:
             apart=size <= most and _separable(joints, later),
             held=not found.stop,
             slow=found.slow,
+            longer=longer,
         )
 
 

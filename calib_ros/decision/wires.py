@@ -30,11 +30,11 @@ DIRECTIONAL = ((2, 3, 4, 5, 6, 7),)
 TERMS = 8  # of `_terms`
 
 
-def wrong_distances(fitted: Fitted) -> tuple[Reason, ...]:
+def wrong_distances(fitted: Fitted) -> tuple[tuple[Reason, ...], Fitted | None]:
     """Return what is wrong with the distances of devices, if that explains a misfit.
 
     Zeros and scales are found by refits. Distances alone show no scale: the arm's lengths imitate
-    it.
+    it. The fit of corrected distances follows, or None if they cannot be corrected.
     """
     problem, sets = fitted.problem, fitted.problem.sets
     wires = [*dict.fromkeys(e.base for e in sets if e.distances is not None and not e.plane)]
@@ -47,8 +47,8 @@ def wrong_distances(fitted: Fitted) -> tuple[Reason, ...]:
     if wires and _errors(fitted, wires, DIRECTIONAL).any():
         what = 'distances depend on the direction of the cable: it leaves over a pulley or an edge'
         remedy = 'Lead it out of a small hole in a firm stand, and measure again'
-        return (Reason(Rule.MISTAKE, f'{what}, or its stand yields. {remedy}'),)
-    return (_corrections(problem, wires, *found.T),) if found.any() else ()
+        return (Reason(Rule.MISTAKE, f'{what}, or its stand yields. {remedy}'),), None
+    return ((_corrections(problem, wires, *found.T),) if found.any() else ()), fitted
 
 
 def _corrections(

@@ -99,7 +99,8 @@ def _identified(
     uncertainty = replace(uncertainty, parts=wider**2 * uncertainty.parts)
     parameters = parameter_rows(fitted, uncertainty)
     region, scaled = _region(inference, posterior, wider)
-    step = None if (wrong := wrong_distances(fitted)) else find_step(fitted)
+    wrong, corrected = wrong_distances(fitted)
+    step = find_step(corrected) if corrected else None
     result = Identification(
         chain=chain,
         before=before.chain,

@@ -21,6 +21,11 @@ from calib_ros.kinematics.se3 import norms
 ANCHOR = np.array([1.5, 0.4, -0.5])
 
 
+def told(fitted):
+    """Return what is wrong with the distances of a fit."""
+    return wrong_distances(fitted)[0]
+
+
 def in_front(count, seed):
     """Return a generator, an arm, and positions in the half of its reach towards the anchor."""
     rng, true, _ = measured_arm(seed, 1)
@@ -60,7 +65,7 @@ def test_a_sag_that_looks_like_the_zero_of_a_draw_wire_is_not_taken_for_it(seed)
     true = faulty(tx90, Cell(), rng).with_effect_values(bends)
     seen = measure(true, tx90.random_joints(60, rng), rng, 3e-5, oriented=False)
     lengths = np.linalg.norm(seen.positions, axis=1)
-    assert not wrong_distances(fit(Problem(tx90, replace(seen, distances=lengths))))
+    assert not told(fit(Problem(tx90, replace(seen, distances=lengths))))
 
 
 def test_the_zeros_of_several_draw_wires_are_named_together():
@@ -84,7 +89,7 @@ def test_a_base_that_is_held_off_is_not_the_zero_of_a_draw_wire():
     off = free.matrix.copy()
     off[:3, 3] += [0.002, -0.002, 0.002]
     held = replace(UR10E, base=Frame(off, fixed=True))
-    assert not wrong_distances(fit(Problem(held, replace(seen, distances=lengths))))
+    assert not told(fit(Problem(held, replace(seen, distances=lengths))))
 
 
 def test_few_distances_beside_sockets_tell_no_zero():
@@ -94,7 +99,7 @@ def test_few_distances_beside_sockets_tell_no_zero():
     seen = measure(true, true.random_joints(4, rng), rng, 1e-4, oriented=False)
     lengths = np.linalg.norm(seen.positions - [1.2, 0.6, 0.3], axis=1)
     wire = replace(seen, distances=lengths, base='base_wire')
-    assert not wrong_distances(fit(replace(problem, more=[*problem.more, wire])))
+    assert not told(fit(replace(problem, more=[*problem.more, wire])))
 
 
 @pytest.mark.parametrize('scale', [1.0, 1.003, 0.997])
@@ -129,15 +134,15 @@ def test_a_scale_and_a_zero_of_one_draw_wire_are_named_together():
         far = norms(wire.positions - ANCHOR)
         sets.append(replace(wire, distances=(1.0 + scale) * far + zero, base=name))
     problem = Problem(UR10E, sets[0], more=sets[1:2])
-    (found,) = wrong_distances(fit(problem))
+    (found,) = told(fit(problem))
     assert re.match(r'all distances are 3\S+ mm too long, by the zero, and \S+ % too long', found)
     factor, shift = re.search(r'distance=distance\*(\S+)(-\S+) \(if in metres\)', found).groups()
     assert float(factor) == pytest.approx(1.0 / 1.01, abs=5e-4)
     distances = sets[1].distances * float(factor) + float(shift)
     assert identify(replace(problem, more=[replace(sets[1], distances=distances)])).accepted
-    (told,) = wrong_distances(fit(replace(problem, of_messages=True)))
-    assert told.endswith('scale, correct the zero and scale where they are published')
-    (found,) = wrong_distances(fit(Problem(UR10E, sets[0], more=sets[1:])))
+    (found,) = told(fit(replace(problem, of_messages=True)))
+    assert found.endswith('scale, correct the zero and scale where they are published')
+    (found,) = told(fit(Problem(UR10E, sets[0], more=sets[1:])))
     pattern = r'(base_\w+) (\S+) mm and (\S+) %'
     sizes = {name: [float(each) for each in pair] for name, *pair in re.findall(pattern, found)}
     np.testing.assert_allclose(sizes['base_one'], (30.0, 1.0), rtol=0.05)
@@ -149,7 +154,7 @@ def test_distances_alone_show_no_scale(scale):
     """Nor does a fit that leaves much, though all of it would shrink with the arm."""
     rng, _, seen = in_front(100, 5)
     far = scale * norms(seen.positions - ANCHOR) + rng.normal(scale=2e-3, size=100)
-    assert not wrong_distances(fit(Problem(UR10E, replace(seen, distances=far))))
+    assert not told(fit(Problem(UR10E, replace(seen, distances=far))))
 
 
 @pytest.mark.parametrize('seed', [1, 2, 3])
