@@ -20,10 +20,11 @@ from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.account import Cause, Lost
 from calib_ros.sampling.buffers import TOO_LATE, Rows, Waiting
 from calib_ros.sampling.hints import Hint, apart, by_turns, ended, restless, sparse
+from calib_ros.sampling.rests import Rests
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.sampler import ROW_WIDTH, TWICE, Found, Numbered, Sampler
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Series, Slice, Stamps, StreamKey
-from calib_ros.sampling.stops import SAMPLED, Rests, SampledStops, Schedule, seen_stops
+from calib_ros.sampling.stops import SAMPLED, SampledStops, Schedule, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.settings import Settings
 from calib_ros.values import MOST_NAMES

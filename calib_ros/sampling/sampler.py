@@ -17,9 +17,9 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.account import Cause, Lost
 from calib_ros.sampling.interpolation import unwrapped
+from calib_ros.sampling.means import averages, mean_of_each
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import POSES, Stamps, StreamKey
-from calib_ros.sampling.stops import averages, mean_of_each
 from calib_ros.sampling.track import Motion
 
 DISTANCE_SLICE, POSITION_SLICE = slice(0, 1), slice(0, 3)

@@ -18,8 +18,8 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.buffers import AS_FLOATS, Rows
 from calib_ros.sampling.interpolation import continuous, interpolated, last_moves
 from calib_ros.sampling.intervals import intersection, silences, standing_intervals, union
+from calib_ros.sampling.means import MOST_SPREAD
 from calib_ros.sampling.slices import SILENCE, Series, Stamps
-from calib_ros.sampling.stops import MOST_SPREAD
 from calib_ros.settings import EXCEPTION
 
 APART = 'joint states too far apart'

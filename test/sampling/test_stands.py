@@ -7,8 +7,10 @@ from streams import hear, stamps, stops
 
 from calib_ros import CalibrationSession
 from calib_ros.estimation.configurations import SCATTER
+from calib_ros.sampling.means import SPIKE
+from calib_ros.sampling.rests import Rests
 from calib_ros.sampling.slices import NO_ACCIDENT
-from calib_ros.sampling.stops import SAMPLED, SPIKE, Rests, SampledStops, Schedule, seen_stops
+from calib_ros.sampling.stops import SAMPLED, SampledStops, Schedule, seen_stops
 from calib_ros.sampling.track import Track
 from calib_ros.settings import Settings
 

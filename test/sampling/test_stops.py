@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from calib_ros.estimation.levels import FEW
-from calib_ros.sampling.stops import MOST_SPREAD, averages
+from calib_ros.sampling.means import MOST_SPREAD, averages
 
 SIGMA = 5e-5
 PLACE = np.array([1.2, -0.3, 0.8])
