@@ -12,9 +12,10 @@ import numpy as np
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.buffers import Rows
+from calib_ros.sampling.clock_hints import ambiguous, clocks_moved, disagreement, stuck
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.delay import LEAST_MOTION, SMOOTHING, STEP, Delay, find_delay
-from calib_ros.sampling.hints import Hint, ambiguous, clocks_moved, disagreement, stuck
+from calib_ros.sampling.hints import Hint
 from calib_ros.sampling.sampler import POSITION_SLICE, QUAT_SLICE
 from calib_ros.sampling.slices import Piece, Series, StreamKey
 from calib_ros.settings import Settings

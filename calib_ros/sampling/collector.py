@@ -19,7 +19,8 @@ import numpy as np
 from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.account import Cause, Lost
 from calib_ros.sampling.buffers import TOO_LATE, Rows, Waiting
-from calib_ros.sampling.hints import Hint, apart, by_turns, ended, restless, sparse
+from calib_ros.sampling.clock_hints import apart, ended
+from calib_ros.sampling.hints import Hint, by_turns, restless, sparse
 from calib_ros.sampling.rests import Rests
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.sampler import ROW_WIDTH, TWICE, Found, Numbered, Sampler

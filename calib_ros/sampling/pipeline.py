@@ -13,8 +13,9 @@ from calib_ros.sampling.account import Cause
 from calib_ros.sampling.clocks import Clocks
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.gate import Gate
-from calib_ros.sampling.hints import Hint, of_two_places, unmeasured, unsettled, unstopped
+from calib_ros.sampling.hints import Hint, unmeasured, unsettled, unstopped
 from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.sample_hints import of_two_places
 from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice
 from calib_ros.sampling.stops import MOVING
 from calib_ros.settings import Settings

@@ -22,13 +22,15 @@ from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.account import Account, Cause
 from calib_ros.sampling.dataset import Dataset, check_settings, collect, dataset_of
 from calib_ros.sampling.delay import Delay
-from calib_ros.sampling.hints import Hint, frozen, losses, progress, spoilt, unheard, unseen
+from calib_ros.sampling.forecast import progress
+from calib_ros.sampling.hints import Hint, losses, unheard
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.message_filter import FrameNames, JointNames, MessageFilter
 from calib_ros.sampling.messages import frame_name
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.pipeline import Pipeline
 from calib_ros.sampling.sample import Frames, Sample, named, socket_place
+from calib_ros.sampling.sample_hints import frozen, spoilt, unseen
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Part
 from calib_ros.settings import Settings
 from calib_ros.shown import some
