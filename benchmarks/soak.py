@@ -60,8 +60,8 @@ from std_srvs.srv import Trigger
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.sampling.message_filter import NO_STAMP
 from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.usable import NO_STAMP
 
 LEG = 1.2
 """Time from one stop to the next [s], half of it in motion."""

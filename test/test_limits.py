@@ -19,8 +19,8 @@ from calib_ros.files.vocabulary import COVARIANCE
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.urdf import chain_from_urdf
-from calib_ros.sampling.message_filter import usable
 from calib_ros.sampling.slices import Part
+from calib_ros.sampling.usable import usable
 from calib_ros.texts import LARGEST_TABLE, parse_yaml
 
 ARM = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4)))

@@ -23,10 +23,10 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.account import Lost
 from calib_ros.sampling.cdr import Layouts
-from calib_ros.sampling.message_filter import usable
 from calib_ros.sampling.messages import TRANSFORMS, short_type
 from calib_ros.sampling.slices import Part
 from calib_ros.sampling.sources import Source
+from calib_ros.sampling.usable import usable
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, some
 from calib_ros.values import SAME

@@ -17,9 +17,9 @@ from calib_ros.files.recording import Recording, write_bag
 from calib_ros.files.stored import recorded
 from calib_ros.sampling.account import Cause
 from calib_ros.sampling.buffers import TOO_LATE
-from calib_ros.sampling.message_filter import NO_STAMP
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, POSES
+from calib_ros.sampling.usable import NO_STAMP
 
 
 @pytest.fixture(params=['sqlite3', 'mcap'])

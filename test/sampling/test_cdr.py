@@ -18,9 +18,9 @@ from recorded import (
 )
 
 from calib_ros.sampling.cdr import alike, message_layout, trajectory_size
-from calib_ros.sampling.message_filter import usable
 from calib_ros.sampling.messages import JOINT_STATE, MEASURES, head_of
 from calib_ros.sampling.slices import Part
+from calib_ros.sampling.usable import usable
 
 NAMES = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)
 NUMBERS = st.floats(-1e6, 1e6)
