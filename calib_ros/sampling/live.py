@@ -36,8 +36,8 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import DELAY, DH_ANGLES, IN_A_FRAME, Parameter
 from calib_ros.kinematics.se3 import Flags, FloatArray, norms
-from calib_ros.sampling.dataset import collect
 from calib_ros.sampling.sample import Frames, Sample
+from calib_ros.sampling.sets import collect
 from calib_ros.settings import Settings
 
 WIDE = (Settings.largest_length / 5.0, Settings.largest_angle / 5.0)

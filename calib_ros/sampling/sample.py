@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples: measurements at one stop of the arm, or at one moment of its motion.
 
-Samples come from the live node, the journal, or the rows of a table. `dataset.py` makes sets of
-observations and problems of them.
+Samples come from the live node, the journal, or the rows of a table. `sets.py` makes observations
+of them, `dataset.py` problems.
 """
 
 from __future__ import annotations

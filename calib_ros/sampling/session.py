@@ -20,7 +20,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.account import Account, Cause
-from calib_ros.sampling.dataset import Dataset, check_settings, collect, dataset_of
+from calib_ros.sampling.dataset import Dataset, check_settings, dataset_of
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.forecast import progress
 from calib_ros.sampling.frame_names import FrameNames
@@ -33,6 +33,7 @@ from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.pipeline import Pipeline
 from calib_ros.sampling.sample import Frames, Sample, named, socket_place
 from calib_ros.sampling.sample_hints import frozen, spoilt, unseen
+from calib_ros.sampling.sets import collect
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Part
 from calib_ros.settings import Settings
 from calib_ros.shown import some
