@@ -11,9 +11,9 @@ from calib_ros.apply import simulation
 from calib_ros.files.bags import replay
 from calib_ros.files.recording import Recording
 from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.sampling.batches import Stream
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.streams import Stream
 from calib_ros.settings import STORAGES, Settings
 
 MS = 1_000_000

@@ -52,10 +52,11 @@ from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros import advisor as advisor_module, inputs as inputs_module, node as node_module
 from calib_ros.ros.inputs import deserialised
 from calib_ros.ros.node import CalibrationNode
-from calib_ros.sampling.batches import Stream, feed
+from calib_ros.sampling.batches import feed
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import STANDARD
+from calib_ros.sampling.streams import Stream
 from calib_ros.settings import Settings
 
 LATCHED = QoSProfile(

@@ -6,10 +6,11 @@ import numpy as np
 import recorded
 
 from calib_ros.kinematics import se3
-from calib_ros.sampling.batches import Stream, feed
+from calib_ros.sampling.batches import feed
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.slices import Part
 from calib_ros.sampling.sources import Source
+from calib_ros.sampling.streams import Stream
 
 MS = 1_000_000
 S = 1_000_000_000

@@ -19,9 +19,10 @@ from calib_ros.files.cameras import cameras_of
 from calib_ros.files.unpacked import unpacked_files
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.account import ALLOW, Account, allowing, too_much_lost
-from calib_ros.sampling.batches import Deserialise, Stream, batches, feed, links_of
+from calib_ros.sampling.batches import Deserialise, batches, feed
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES, head_of
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.streams import Stream, links_of
 from calib_ros.sampling.topics import MessagesOn, Recorded, check_joints, choose_topics
 
 if TYPE_CHECKING:

@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any
 from calib_ros.errors import MOST_ENTRIES, ConfigError
 from calib_ros.files import mcap
 from calib_ros.files.unpacked import recorded_files
-from calib_ros.sampling.batches import Stream
 from calib_ros.sampling.messages import PICTURES
+from calib_ros.sampling.streams import Stream
 from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, parse_yaml, read_text
 

@@ -30,9 +30,10 @@ from rclpy.time_source import CLOCK_TOPIC
 from rclpy.waitable import Waitable
 
 from calib_ros.errors import ConfigError
-from calib_ros.sampling.batches import BATCH, Stream, links_of
+from calib_ros.sampling.batches import BATCH
 from calib_ros.sampling.messages import CAMERA_INFO, PICTURES, short_type
 from calib_ros.sampling.slices import NO_ACCIDENT, SILENCE
+from calib_ros.sampling.streams import Stream, links_of
 from calib_ros.settings import EXCEPTION
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT

@@ -46,12 +46,13 @@ from calib_ros.ros.inputs import Batched, Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, UNSAVED, Keeper
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown_names
 from calib_ros.ros.to_ros import LATCHED
-from calib_ros.sampling.batches import Stream, feed, source_streams
+from calib_ros.sampling.batches import feed
 from calib_ros.sampling.dataset import check_settings
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sample import Sample, socket_place
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import STANDARD, parse_sources
+from calib_ros.sampling.streams import Stream, source_streams
 
 DIAGNOSTICS_PERIOD = 1.0  # time [s] between two reports on /diagnostics, the usual one
 TAKING_PERIOD = DIAGNOSTICS_PERIOD / 10.0

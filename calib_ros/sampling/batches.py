@@ -9,24 +9,21 @@ one, and grouped by their names. Both give the same arrays, with the place of ea
 from __future__ import annotations
 
 import itertools
-import struct
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.cdr import alike, message_layout, read_header
+from calib_ros.sampling.cdr import read_header
+from calib_ros.sampling.decoding import UNDECODED, by_layout
 from calib_ros.sampling.messages import (
     BODIES,
     CAMERA_INFO,
     FORMS,
     JOINT_STATE,
-    LINKS,
-    TRANSFORMS,
     Reading,
     bodies_of,
     frame_name,
@@ -34,60 +31,12 @@ from calib_ros.sampling.messages import (
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import POSES, Part
-from calib_ros.sampling.sources import Source
-from calib_ros.sampling.transforms import STATIC, Links
+from calib_ros.sampling.streams import Batch, Stream
+from calib_ros.sampling.transforms import Links
 from calib_ros.texts import LARGEST_TABLE
 
 BATCH = 2000  # messages taken at once (benchmarks/bags.py, benchmarks/soak.py)
 Deserialise: TypeAlias = Callable[[bytes, str], Any]  # converts bytes and a type to a message
-Batch: TypeAlias = 'Sequence[tuple[Stream, bytes]]'
-"""Streams and their serialised messages, in order of arrival."""
-
-
-UNDECODED = 'a message on {} cannot be decoded: {}'
-
-
-@dataclass(frozen=True)
-class Stream:
-    """Messages of one topic: their type, and what they measure; None for joint states.
-
-    A topic of transforms may measure several things, or hold static ones; a CameraInfo belongs to
-    the topic of the images.
-    """
-
-    topic: str
-    type: str
-    source: Source | None = None
-    links: Links | None = None
-
-    @property
-    def still(self) -> bool:
-        """Tell whether it holds static links."""
-        return self.links is not None and self.topic != self.links.topic
-
-
-def source_streams(sources: Sequence[Source], types: Mapping[str, str]) -> list[Stream]:
-    """Return the streams of sources; `types` (by topic) apply where they name none."""
-    streams = []
-    linked: dict[tuple[str, str], list[Source]] = {}
-    for source in sources:
-        kind = source.type or types[source.topic]
-        if kind in LINKS:
-            linked.setdefault((source.topic, kind), []).append(source)
-            continue
-        streams.append(Stream(source.topic, kind, source))
-        if source.board:
-            streams.append(Stream(source.camera_info, CAMERA_INFO, source))
-    for (topic, kind), some in linked.items():
-        links = Links(topic, some, kind)
-        names = (topic + STATIC, topic) if kind == TRANSFORMS else (topic,)
-        streams += [Stream(name, kind, None, links) for name in names]
-    return streams
-
-
-def links_of(streams: Iterable[Stream]) -> list[Links]:
-    """Return the links between frames on some streams."""
-    return list(dict.fromkeys(each.links for each in streams if each.links is not None))
 
 
 def batches(messages: Iterator[tuple[Stream, bytes]]) -> Iterator[tuple[Batch, Exception | None]]:
@@ -135,7 +84,7 @@ def decode(
     parts: list[Part] = []
     problems: list[str] = []
     linked: dict[Links, tuple[list[Part], list[Part]]] = {}  # moving and still ones
-    decoded = _by_layout(batch, problems)
+    decoded = by_layout(batch, problems)
     others = _one_by_one(batch, deserialise, pictures, problems)
     for stream, part in itertools.chain(decoded, others):
         if stream.type != JOINT_STATE and any(name[:1] == '/' for name in part.strings):
@@ -150,27 +99,6 @@ def decode(
         for cause, count in faults.items():
             miss(POSES, count, cause)
     return parts, problems
-
-
-def _by_layout(batch: Batch, problems: list[str]) -> Iterator[tuple[Stream, Part]]:
-    """Yield joint states and measurements with the same names, and their stream."""
-    groups: dict[tuple[str, int, bytes], list[int]] = {}
-    for place, (stream, data) in enumerate(batch):
-        if stream.type in FORMS:
-            groups.setdefault((stream.topic, len(data), data[:2]), []).append(place)
-    for group in groups.values():
-        stream, places = batch[group[0]][0], np.array(group)
-        left = np.ones(len(places), dtype=bool)
-        known = {} if stream.links is None else stream.links.layouts
-        blobs = [batch[place][1] for place in group]
-        for which, names, stamps, numbers in alike(stream.type, blobs, known):
-            left[which] = False
-            yield stream, Part(places[which], stream.source, names, stamps, numbers)
-        for k in np.flatnonzero(left).tolist():
-            try:
-                message_layout(stream.type, blobs[k])
-            except (struct.error, UnicodeDecodeError) as err:
-                problems.append(UNDECODED.format(stream.topic, err))
 
 
 def _one_by_one(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 from calib_ros.errors import InputError
-from calib_ros.sampling.batches import Deserialise, Stream, batches, decode, source_streams
+from calib_ros.sampling.batches import Deserialise, batches, decode
 from calib_ros.sampling.messages import (
     CAMERA_INFO,
     JOINT_STATE,
@@ -18,6 +18,7 @@ from calib_ros.sampling.messages import (
     short_type,
 )
 from calib_ros.sampling.sources import TYPES, Source, parse_source, parse_sources
+from calib_ros.sampling.streams import Stream, source_streams
 from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.settings import Settings
 

@@ -22,7 +22,7 @@ from calib_ros.errors import MOST_ENTRIES
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.account import Lost
-from calib_ros.sampling.cdr import Layouts
+from calib_ros.sampling.message_layout import Layouts
 from calib_ros.sampling.messages import TRANSFORMS, short_type
 from calib_ros.sampling.slices import Part
 from calib_ros.sampling.sources import Source

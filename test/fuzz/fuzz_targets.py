@@ -250,10 +250,11 @@ def metadata(path):
 def message(data):
     """The first byte chooses the type; messages are divided by a mark."""
     from calib_ros.files.bags import _deserialiser
-    from calib_ros.sampling.batches import Stream, feed
+    from calib_ros.sampling.batches import feed
     from calib_ros.sampling.messages import JOINT_STATE, MEASURES
     from calib_ros.sampling.session import CalibrationSession
     from calib_ros.sampling.sources import Source
+    from calib_ros.sampling.streams import Stream
 
     session = CalibrationSession(ARM)
     types = [JOINT_STATE, *MEASURES]

@@ -25,10 +25,11 @@ from calib_ros.kinematics.chain_file import calibration_record, dump_chain, load
 from calib_ros.report.refusals import rules
 from calib_ros.ros.identifying import KEEP, NOT_FILED, ONE_BEFORE
 from calib_ros.ros.inputs import deserialised
-from calib_ros.sampling.batches import Stream, feed
+from calib_ros.sampling.batches import feed
 from calib_ros.sampling.clock_hints import apart
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sources import STANDARD
+from calib_ros.sampling.streams import Stream
 from calib_ros.shown import moment
 
 

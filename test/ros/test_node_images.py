@@ -28,11 +28,12 @@ from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.lens import Lens
 from calib_ros.ros.inputs import deserialised
 from calib_ros.sampling import pictures
-from calib_ros.sampling.batches import Stream, feed, source_streams
+from calib_ros.sampling.batches import feed
 from calib_ros.sampling.messages import CAMERA_INFO, JOINT_STATE, PICTURES
 from calib_ros.sampling.pictures import Flaw
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import parse_sources
+from calib_ros.sampling.streams import Stream, source_streams
 from calib_ros.settings import Settings
 from calib_ros.texts import dump_yaml
 

@@ -26,13 +26,14 @@ from streams import (
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.sampling.account import Cause, lost
-from calib_ros.sampling.batches import Stream, decode
+from calib_ros.sampling.batches import decode
 from calib_ros.sampling.frame_names import FrameNames
 from calib_ros.sampling.joint_names import JointNames
 from calib_ros.sampling.message_filter import MessageFilter
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import POSES, Part
 from calib_ros.sampling.sources import Source
+from calib_ros.sampling.streams import Stream
 from calib_ros.settings import Mode, Settings
 
 POINT = 'geometry_msgs/msg/PointStamped'

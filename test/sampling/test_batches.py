@@ -9,9 +9,10 @@ from recorded import TYPESTORE, joint_state, point_stamped, pose_stamped
 from calib_ros import CalibrationSession, Settings, load_chain
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.kinematics.se3 import to_quat
-from calib_ros.sampling.batches import Stream, feed
+from calib_ros.sampling.batches import feed
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sources import Source
+from calib_ros.sampling.streams import Stream
 
 ARM = load_chain('ur10e')
 POSE, POINT = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PointStamped'

@@ -17,7 +17,9 @@ from recorded import (
     transform_stamped,
 )
 
-from calib_ros.sampling.cdr import alike, message_layout, trajectory_size
+from calib_ros.sampling.cdr import trajectory_size
+from calib_ros.sampling.decoding import alike
+from calib_ros.sampling.message_layout import message_layout
 from calib_ros.sampling.messages import JOINT_STATE, MEASURES, head_of
 from calib_ros.sampling.slices import Part
 from calib_ros.sampling.usable import usable
