@@ -39,12 +39,15 @@ from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import documents, words
 from calib_ros.ros.advisor import Guide
 from calib_ros.ros.arguments import PARAMETERS
-from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, InOrder, run_node
+from calib_ros.ros.boundary import Answer, Boundary
+from calib_ros.ros.calls import InOrder
+from calib_ros.ros.deferred import DeferredTrigger
 from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.identifying import Filer, Identifying
 from calib_ros.ros.inputs import Batched, Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, UNSAVED, Keeper
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown_names
+from calib_ros.ros.running import run_node
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.batches import feed
 from calib_ros.sampling.dataset import check_settings

@@ -44,15 +44,15 @@ def ended_by(monkeypatch):
     Besides, there may be a parameter file. Signals stay with the tests; a node that does not end
     is given to `spun`, if it may go on.
     """
-    from calib_ros.ros import boundary, node
+    from calib_ros.ros import node, running
 
-    monkeypatch.setattr(boundary, '_handle_signals', lambda handler: None)
+    monkeypatch.setattr(running, '_handle_signals', lambda handler: None)
 
     def endless(*_):
         pytest.fail('the node does not end')
 
     def run(*parameters, file=None, names=(), spun=endless):
-        monkeypatch.setattr(boundary, '_spin', spun)
+        monkeypatch.setattr(running, '_spin', spun)
         words = ['--params-file', str(file)] if file else []
         words += [word for rule in names for word in ('-r', rule)]
         words += [word for given in parameters for word in ('-p', given)]

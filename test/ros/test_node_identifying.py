@@ -21,7 +21,7 @@ from calib_ros.files.history import History
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.ros.arguments import NODE
-from calib_ros.ros.boundary import InOrder
+from calib_ros.ros.calls import InOrder
 from calib_ros.ros.identifying import ONE_BEFORE
 from calib_ros.ros.outputs import Keeper
 from calib_ros.sampling.session import CalibrationSession

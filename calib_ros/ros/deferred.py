@@ -1,0 +1,84 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Services whose work runs on a thread of its own, and is answered when it ends."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from calib_ros.ros.boundary import Answer
+
+
+class DeferredTrigger:
+    """A Trigger service whose work runs on a separate thread.
+
+    The answer is sent through the service's `send_response` right after the callback, on the same
+    thread. It is replaced here by one that holds the answer back until the work has ended. An
+    async callback starves the node's timers in rclpy's single-threaded
+    executor. Several threads, one for each such service and one for the rest, would need a lock
+    around the session, and cost an idle node 13 % more. A call during the work is refused at once.
+
+    `prepare` returns a snapshot on the executor's thread, `work` answers from it. `answer` takes
+    the name and either of them, and converts its result or exception to an answer.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        answer: Callable[[str, Callable[[], Answer]], Answer],
+        prepare: Callable[[], Any],
+        work: Callable[[Any], Answer],
+    ) -> None:
+        self._answer = partial(answer, name)
+        self._prepare, self._work = prepare, work
+        self._thread: threading.Thread | None = None
+        self._running = threading.Event()
+        self._snapshot: list[Any] = []
+        self._service = node.create_service(Trigger, name, self._on_call)
+        self._send = self._service.send_response
+        self._service.send_response = self._send_unless_deferred
+
+    @property
+    def busy(self) -> bool:
+        """Tell whether work runs."""
+        return self._running.is_set()
+
+    def join(self, timeout: float | None) -> bool:
+        """Wait for the work [s], with None to its end; return whether it has ended."""
+        if self._thread is not None:
+            self._thread.join(timeout)
+        return self._thread is None or not self._thread.is_alive()
+
+    def _on_call(self, request: Any, response: Any) -> Any:
+        def prepare() -> Answer:
+            if self.busy:
+                return False, 'refused: the previous call is still running; wait for its answer'
+            self._snapshot = [self._prepare()]
+            return True, ''
+
+        response.success, response.message = self._answer(prepare)
+        return response
+
+    def _send_unless_deferred(self, response: Any, header: Any) -> None:
+        if not self._snapshot:
+            self._send(response, header)
+            return
+        given = self._snapshot.pop(), response, header
+        self._running.set()
+        self._thread = threading.Thread(target=self._run, args=given, daemon=True)
+        self._thread.start()
+
+    def _run(self, snapshot: Any, response: Any, header: Any) -> None:
+        response.success, response.message = self._answer(lambda: self._work(snapshot))
+        self._running.clear()  # before the answer, since the caller may call again at once
+        try:
+            self._send(response, header)
+        except Exception:  # the node has ended
+            return
