@@ -40,7 +40,7 @@ ONLY = {
     **dict.fromkeys(('dask', 'distributed'), ('fleet.',)),
     'rich': ('fleet.', 'cli.screen'),
     'argcomplete': ('cli.main',),
-    'yaml': ('texts', 'ros.arguments'),
+    'yaml': ('texts', 'ros.arguments', 'ros.command_line'),
 }
 
 

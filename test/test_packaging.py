@@ -14,7 +14,7 @@ import yaml
 from test_architecture import MODULES, imports
 
 import calib_ros
-from calib_ros.ros.arguments import PARAMETERS
+from calib_ros.ros.parameter_list import PARAMETERS
 
 ROOT = Path(__file__).parents[1]
 JAZZY = {

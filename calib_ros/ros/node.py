@@ -38,7 +38,6 @@ from calib_ros.identification.recalibration import recalibrate
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import documents, words
 from calib_ros.ros.advisor import Guide
-from calib_ros.ros.arguments import PARAMETERS
 from calib_ros.ros.boundary import Answer, Boundary
 from calib_ros.ros.calls import InOrder
 from calib_ros.ros.deferred import DeferredTrigger
@@ -46,6 +45,7 @@ from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.identifying import Filer, Identifying
 from calib_ros.ros.inputs import Batched, Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, UNSAVED, Keeper
+from calib_ros.ros.parameter_list import BESIDE_A_JOURNAL, PARAMETERS
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown_names
 from calib_ros.ros.running import run_node
 from calib_ros.ros.to_ros import LATCHED
@@ -63,11 +63,6 @@ TAKING_PERIOD = DIAGNOSTICS_PERIOD / 10.0
 three times as much."""
 JOIN_TIMEOUT = DIAGNOSTICS_PERIOD  # time [s] for which the shutdown waits for running work
 WRITING = {'~/export', '~/save'}  # whose work is not cut off, since it writes files
-BESIDE_A_JOURNAL = (
-    *('base_link', 'tip_link', 'serial', 'socket', 'largest_loss'),
-    *('base_frame', 'flange_frame', 'target_frame'),
-)
-"""Parameters of the session that are no `Settings`."""
 STATUS_LENGTH = 120  # characters of the status: `ros2 topic echo` cuts texts at 128
 
 

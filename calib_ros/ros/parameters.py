@@ -3,7 +3,7 @@
 """The node's parameters, and the robot they name.
 
 Every field of `Settings` is a parameter of the same name, with its description and smallest value;
-`arguments.py` lists the others.
+`parameter_list.py` lists the others.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from calib_ros.errors import ConfigError, UnknownNameError, near
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, chain_text, load_chain
 from calib_ros.kinematics.urdf import chain_from_urdf
-from calib_ros.ros.arguments import PARAMETERS, NodeParameter
+from calib_ros.ros.parameter_list import PARAMETERS, NodeParameter
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.sample import socket_place
 from calib_ros.sampling.slices import SILENCE

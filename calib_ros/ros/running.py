@@ -19,7 +19,8 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from calib_ros.errors import CalibrationError, trouble
-from calib_ros.ros.arguments import NODE, refuse_ignored_files, shared_names, typed, usage
+from calib_ros.ros.arguments import NODE
+from calib_ros.ros.command_line import refuse_ignored_files, shared_names, typed, usage
 
 
 def run_node(make: Callable[[Collection[str]], Any], arguments: Sequence[str] | None) -> int:

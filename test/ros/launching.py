@@ -9,7 +9,7 @@ from types import ModuleType, SimpleNamespace
 import rclpy
 from rclpy.node import Node
 
-from calib_ros.ros.arguments import PARAMETERS
+from calib_ros.ros.parameter_list import PARAMETERS
 
 ROOT = Path(__file__).parents[2]
 

@@ -16,7 +16,9 @@ from ros_cell import Cell, topics
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros import node as node_module
-from calib_ros.ros.arguments import PARAMETERS, launch_arguments, refuse_ignored_files, typed
+from calib_ros.ros.arguments import launch_arguments
+from calib_ros.ros.command_line import refuse_ignored_files, typed
+from calib_ros.ros.parameter_list import PARAMETERS
 from calib_ros.settings import STARTUP, Settings
 
 FREE = ('target_filename', 'calibration_filename', 'socket', 'largest_loss', 'marker_scale')
