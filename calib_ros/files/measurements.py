@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.covariances import covariance_faults
 from calib_ros.errors import ColumnsError, ConfigError, InputError
 from calib_ros.files.columns import Codes, Columns, check_quaternions, codes_of, lines_in_words
 from calib_ros.files.headers import listed, named_by_option, refuse_separator
@@ -31,7 +32,7 @@ from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.messages import frame_name
 from calib_ros.sampling.sample import Sample, View, socket_place
-from calib_ros.values import LARGEST, LARGEST_RATE, covariance_faults, parse_number
+from calib_ros.values import LARGEST, LARGEST_RATE, parse_number
 
 SPLITS = {name: name for name in ('', 'train', 'test', 'removed')}
 FLAGS = {'': False, '0': False, 'false': False, '1': True, 'true': True}

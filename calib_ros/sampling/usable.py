@@ -8,10 +8,11 @@ from collections import Counter
 
 import numpy as np
 
+from calib_ros.covariances import covariance_faults
 from calib_ros.kinematics.se3 import Flags
 from calib_ros.sampling.account import Lost
 from calib_ros.sampling.slices import Part
-from calib_ros.values import LARGEST, ROUNDED, covariance_faults
+from calib_ros.values import LARGEST, ROUNDED
 
 NO_STAMP = Lost('zero stamp (fill header.stamp where it is published)')
 NOT_UNIT = 'quaternion not of length 1 (normalise it where it is published)'
