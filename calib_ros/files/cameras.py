@@ -31,7 +31,8 @@ from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.messages import head_of
 from calib_ros.sampling.pictures import Flaw
 from calib_ros.sampling.sample import View
-from calib_ros.sampling.sources import Source, parse_sources
+from calib_ros.sampling.source_texts import parse_sources
+from calib_ros.sampling.sources import Source
 
 SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm')
 ENCODINGS = {'mono8': (1, ''), '8UC1': (1, ''), 'rgb8': (3, 'RGB'), 'bgr8': (3, 'BGR')}

@@ -20,7 +20,7 @@ from calib_ros.files.bags import rosbag2, typestore
 from calib_ros.kinematics.se3 import Flags, FloatArray, to_quat
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.messages import JOINT_STATE
-from calib_ros.sampling.sources import VALIDATION
+from calib_ros.sampling.source_texts import VALIDATION
 
 
 @dataclass(frozen=True, eq=False)

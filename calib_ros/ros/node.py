@@ -54,7 +54,8 @@ from calib_ros.sampling.dataset import check_settings
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sample import Sample, socket_place
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.sources import STANDARD, parse_sources
+from calib_ros.sampling.source_texts import parse_sources
+from calib_ros.sampling.sources import STANDARD
 from calib_ros.sampling.streams import Stream, source_streams
 
 DIAGNOSTICS_PERIOD = 1.0  # time [s] between two reports on /diagnostics, the usual one

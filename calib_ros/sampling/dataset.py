@@ -18,7 +18,7 @@ from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.sample import Frames, Sample, socket_pairs
 from calib_ros.sampling.sets import collect
-from calib_ros.sampling.sources import parse_sources
+from calib_ros.sampling.source_texts import parse_sources
 from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 

@@ -17,7 +17,8 @@ from calib_ros.sampling.messages import (
     PICTURES,
     short_type,
 )
-from calib_ros.sampling.sources import TYPES, Source, parse_source, parse_sources
+from calib_ros.sampling.source_texts import parse_source, parse_sources
+from calib_ros.sampling.sources import TYPES, Source
 from calib_ros.sampling.streams import Stream, source_streams
 from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.settings import Settings

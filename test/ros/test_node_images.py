@@ -32,7 +32,7 @@ from calib_ros.sampling.batches import feed
 from calib_ros.sampling.messages import CAMERA_INFO, JOINT_STATE, PICTURES
 from calib_ros.sampling.pictures import Flaw
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.sources import parse_sources
+from calib_ros.sampling.source_texts import parse_sources
 from calib_ros.sampling.streams import Stream, source_streams
 from calib_ros.settings import Settings
 from calib_ros.texts import dump_yaml

@@ -16,7 +16,7 @@ from test_transforms import TIMES, frame, link, tf
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.stored import LARGEST_MESSAGE
 from calib_ros.kinematics import se3
-from calib_ros.sampling.sources import parse_source
+from calib_ros.sampling.source_texts import parse_source
 
 MOCAP = 'mocap4r2_msgs/msg/RigidBodies'
 NAMED = 'motion_capture_tracking_interfaces/msg/NamedPoseArray'

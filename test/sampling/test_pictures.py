@@ -13,7 +13,7 @@ from calib_ros.sampling import pictures
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import Part
-from calib_ros.sampling.sources import parse_sources
+from calib_ros.sampling.source_texts import parse_sources
 
 pytest.importorskip('cv2')
 

@@ -4,7 +4,8 @@ import pytest
 
 from calib_ros.errors import ConfigError
 from calib_ros.sampling.messages import MEASURES, TRANSFORMS
-from calib_ros.sampling.sources import RANGEFINDER, STANDARD, Source, parse_source, parse_sources
+from calib_ros.sampling.source_texts import parse_source, parse_sources
+from calib_ros.sampling.sources import RANGEFINDER, STANDARD, Source
 
 
 def test_keys_in_any_order():

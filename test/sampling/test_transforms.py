@@ -27,7 +27,7 @@ from calib_ros.sampling.decoding import alike
 from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import Part
-from calib_ros.sampling.sources import parse_sources
+from calib_ros.sampling.source_texts import parse_sources
 from calib_ros.sampling.streams import Stream, source_streams
 from calib_ros.sampling.transforms import Links
 from calib_ros.settings import Settings
