@@ -28,8 +28,8 @@ from calib_ros.files.detector import Detector, Image, opencv
 from calib_ros.files.lenses import lens_of
 from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics.lens import Lens
+from calib_ros.sampling.board_finder import Flaw
 from calib_ros.sampling.messages import head_of
-from calib_ros.sampling.pictures import Flaw
 from calib_ros.sampling.sample import View
 from calib_ros.sampling.source_texts import parse_sources
 from calib_ros.sampling.sources import Source

@@ -14,7 +14,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.resection import board_poses, uncertainty
 from calib_ros.kinematics import se3
 from calib_ros.sampling.account import Cause, Lost
+from calib_ros.sampling.board_finder import BoardFinder, Flaw
 from calib_ros.sampling.sample import Sample, View
 from calib_ros.sampling.slices import POSES
 from calib_ros.texts import LARGEST_TABLE
@@ -32,29 +33,12 @@ MOST_BYTES = 5 * LARGEST_TABLE
 MOST_WAITING = 4  # images that may wait for processing; further ones are dropped
 
 
-class Flaw(NamedTuple):
-    """Why an image is not used: its kind, and what was found in it."""
-
-    cause: str
-    reason: str
-
-
 WHILE_OTHERS = Flaw(
     'while others were processed', f'{MOST_WAITING} others were still processed: stop for longer'
 )
 FORGOTTEN = Flaw(
     'dropped, memory for images full', 'the memory for images was full: send fewer or smaller ones'
 )
-
-
-class BoardFinder(Protocol):
-    """A board detector for images."""
-
-    def learn(self, info: Any) -> None:
-        """Take a CameraInfo."""
-
-    def look(self, message: Any) -> View | Flaw:
-        """Return the corners in an Image or CompressedImage."""
 
 
 class Pictures:

@@ -23,7 +23,7 @@ from calib_ros.files.detector import Detector, detect
 from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
-from calib_ros.sampling.pictures import Flaw
+from calib_ros.sampling.board_finder import Flaw
 
 cv2 = pytest.importorskip('cv2')
 from photographs import CHARUCO, rendered

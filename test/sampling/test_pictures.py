@@ -10,6 +10,7 @@ import pytest
 from calib_ros.files.cameras import grey
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling import pictures
+from calib_ros.sampling.board_finder import Flaw
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import Part
@@ -26,7 +27,7 @@ class Blind:
 
     def look(self, message):
         assert self.release.wait(60)
-        return pictures.Flaw('without board', 'no board in it')
+        return Flaw('without board', 'no board in it')
 
 
 def test_why_an_image_is_not_looked_at_is_told():
