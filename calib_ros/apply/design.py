@@ -24,7 +24,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
-from calib_ros.sampling.live import Estimate
+from calib_ros.sampling.estimate import Estimate
 from calib_ros.settings import LEVER
 from calib_ros.shown import Shown
 

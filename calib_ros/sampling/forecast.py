@@ -11,9 +11,13 @@ import numpy as np
 from calib_ros.estimation.levels import NEARER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.live import Estimate, barely_moved
+from calib_ros.sampling.estimate import Estimate
 from calib_ros.settings import Settings
 from calib_ros.shown import counted
+
+LITTLE = 0.35
+"""Range [rad] of a joint over all samples that is too little: 20 degrees (or 0.035 m). A
+convention."""
 
 
 def progress(
@@ -50,3 +54,10 @@ def _forecast(estimate: Estimate, settings: Settings) -> str:
     if more > settings.pose_buffer:
         return f'{1e3 * wanted:g} mm is out of reach: are units, sigmas and wanted_accuracy right?'
     return f'about {more} more for {1e3 * wanted:g} mm'
+
+
+def barely_moved(chain: Chain, joints: FloatArray) -> tuple[str, ...]:
+    """Return the movable joints whose values (N, n) span too little to determine them."""
+    least = [LITTLE if joint.type == 'revolute' else 0.1 * LITTLE for joint in chain.joints]
+    little = np.flatnonzero(np.ptp(joints, axis=0) < least).tolist()
+    return tuple(chain.joint_names[k] for k in little if k not in chain.held)

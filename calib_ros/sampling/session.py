@@ -22,11 +22,12 @@ from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.account import Account, Cause
 from calib_ros.sampling.dataset import Dataset, check_settings, dataset_of
 from calib_ros.sampling.delay import Delay
+from calib_ros.sampling.estimate import Estimate
 from calib_ros.sampling.forecast import progress
 from calib_ros.sampling.frame_names import FrameNames
 from calib_ros.sampling.hints import Hint, losses, unheard
 from calib_ros.sampling.joint_names import JointNames
-from calib_ros.sampling.live import Estimate, LiveEstimate
+from calib_ros.sampling.live import LiveEstimate
 from calib_ros.sampling.message_filter import MessageFilter
 from calib_ros.sampling.messages import frame_name
 from calib_ros.sampling.pictures import Pictures

@@ -11,8 +11,9 @@ from calib_ros import CalibrationSession, Chain, Settings, identify
 from calib_ros.apply.simulation import Cell, faulty, random_frame
 from calib_ros.kinematics.chain import Joint
 from calib_ros.kinematics.se3 import exp_rotation
-from calib_ros.sampling import live as live_module
-from calib_ros.sampling.live import START, LiveEstimate, barely_moved
+from calib_ros.sampling import live as live_module, live_fit as fit_module
+from calib_ros.sampling.forecast import barely_moved
+from calib_ros.sampling.live import START, LiveEstimate
 
 
 def session(**settings):
@@ -174,7 +175,7 @@ def test_samples_that_make_no_problem_yet_are_told_or_waited_for(rng, monkeypatc
     estimate, refused, _ = learned([*samples, *by_wire(samples, 1e3)])
     assert (estimate, 'are they in metres' in refused) == (None, True)
     with monkeypatch.context() as failing:
-        failing.setattr(live_module, 'start_frames', lambda *_: np.linalg.inv(np.zeros((1, 1))))
+        failing.setattr(fit_module, 'start_frames', lambda *_: np.linalg.inv(np.zeros((1, 1))))
         assert learned(samples) == (None, '', ())
     assert learned(samples).estimate.samples == 20
 
