@@ -90,7 +90,7 @@ def _fitting(value: Any, hint: Any, name: str, finite: bool) -> Any:
             return value
         raise UnknownNameError(name, value, parts)
     elif getattr(kind, '__name__', '') in _ARRAYS:
-        from calib_ros.values import array_of  # loads numpy, not needed by --help
+        from calib_ros.arrays import array_of
 
         return array_of(value, (get_args(parts[-1]) or parts)[0], name, finite)
     elif kind is Mapping and isinstance(value, Mapping):

@@ -31,6 +31,7 @@ from typing import Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 
+from calib_ros.arrays import array_of
 from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.joint import (
@@ -51,7 +52,6 @@ from calib_ros.kinematics.parameter import (
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.walk import BLOCK, Walk
 from calib_ros.shown import Shown
-from calib_ros.values import array_of
 
 Convention: TypeAlias = Literal['standard', 'modified']
 
