@@ -27,7 +27,7 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     value = getattr(importlib.import_module(_HOMES[name]), name)
     if hasattr(value, '__dataclass_fields__'):
-        value.__doc__ = importlib.import_module('calib_ros.shown').WithFields(value)
+        value.__doc__ = importlib.import_module('calib_ros.documented').WithFields(value)
     globals()[name] = value
     return value
 

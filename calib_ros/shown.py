@@ -4,16 +4,12 @@
 
 from __future__ import annotations
 
-import ast
 import html
-import inspect
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from datetime import datetime, timezone
-from itertools import chain, takewhile
 from typing import Any
 
 import numpy as np
@@ -106,38 +102,10 @@ class Shown:
         return f'<table><caption>{type(self).__name__}</caption>{"".join(rows)}</table>'
 
 
-class WithFields:
-    """The docstring of a dataclass with its fields as they are written, for help().
-
-    The source is read only when it is asked for; what cannot be found is left out.
-    """
-
-    def __init__(self, documented: type) -> None:
-        self._of, self._text = documented, documented.__doc__ or ''
-
-    def __get__(self, instance: object, owner: type) -> str:
-        """Return the text."""
-        with suppress(OSError):
-            each = (of for of in reversed(self._of.__mro__) if '__dataclass_fields__' in vars(of))
-            return '\n'.join([self._text, *chain.from_iterable(map(_fields, each))])
-        return self._text
-
-
-def _fields(of: type) -> list[str]:
-    """Return the lines of the fields of a dataclass, without those that it inherits."""
-    lines = inspect.getsource(of).splitlines()
-    (found,) = ast.parse(textwrap.dedent('\n'.join(lines))).body
-    assert isinstance(found, ast.ClassDef)
-    body = list(takewhile(lambda x: isinstance(x, ast.AnnAssign | ast.Expr), found.body))
-    begin, end = (each.end_lineno or 0 for each in (body[0], body[-1]))
-    return lines[begin:end]
-
-
 def as_html(caption: str, text: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return paragraphs and a table, whose first row is the header, for notebooks."""
     lines = [f'<p><strong>{html.escape(caption)}</strong></p>']
-    lines += [f'<p>{html.escape(each)}</p>' for each in text]
-    lines.append('<table>')
+    lines += [*(f'<p>{html.escape(each)}</p>' for each in text), '<table>']
     for k, row in enumerate(rows):
         tag = 'td' if k else 'th'
         cells = ''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for cell in row)
