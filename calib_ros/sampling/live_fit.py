@@ -16,8 +16,9 @@ import numpy as np
 
 from calib_ros.estimation.gross_errors import chance_of_outliers, thorough_fit
 from calib_ros.estimation.identifiability import structurally_independent
-from calib_ros.estimation.leastsquares import STEP_TOLERANCE, normal_equations
+from calib_ros.estimation.leastsquares import STEP_TOLERANCE
 from calib_ros.estimation.levels import SURE
+from calib_ros.estimation.normal import normal_equations
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import robust_fit
