@@ -335,40 +335,6 @@ def test_the_arrays_of_a_page_are_the_poses(solved):
     assert np.linalg.norm(there - true, axis=1).max() < 2e-3
 
 
-def test_distances_and_outliers_have_pages():
-    rows = measured(count=80)
-    far = np.linalg.norm(rows.positions - [1.0, 1.0, 0.5], axis=1)
-    wire = replace(rows.at(rows.stamps_ns + 7), distances=far, base='base_wire')
-    wire = replace(wire, oriented=np.zeros(80, bool))
-    shifted = rows.positions.copy()
-    shifted[7] += 0.02
-    problem = Problem(UR, replace(rows, positions=shifted), more=(wire,))
-    result = identify(problem)
-    poses = poses_of(problem, result)
-    assert len(poses) == 160
-    assert poses.outlier.sum() == len(result.outliers) > 0
-    page = page_of(report_of(problem, result))
-    assert 'Outliers: ' in page.text
-    assert 'touched planes are along one direction' in page.text
-    assert '160 poses, 1 of them an outlier with little or no weight' in page.text
-    assert poses.source(int(np.flatnonzero(poses.outlier)[0])) in page.text
-
-
-def test_outliers_held_out_are_listed_too(unsearched):
-    """They have no weight to lose; the table had those of the fit only."""
-    problem = problem_of()
-    problem.judging[0].positions[3] += 0.02
-    for fitted in (False, True):
-        if fitted:
-            problem.sets[0].positions[7] += 0.03
-        report = report_of(problem, identify(problem))
-        (table,) = (each for each in report.sections if each.name == 'outliers')
-        assert table.title == f'Outliers: {1 + fitted} of {TRAIN + TEST} poses'
-        assert [row[1] for row in table.rows][fitted:] == ['held out']
-        assert table.head[1] == 'residual [usual errors]'  # along one axis: a usual pose has 1.5
-        assert [float(row[2]) > 10.0 for row in table.rows] == [True] * (1 + fitted)
-
-
 def test_poses_and_measurements_are_two_counts(solved):
     """A bag gives several measurements of each pose; what is empty is no fact."""
     counts = {'samples': TRAIN, 'poses': 3 * TRAIN, 'foreign_names': (), 'unused': {}}
