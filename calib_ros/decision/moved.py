@@ -16,7 +16,7 @@ ZERO = 'zero'  # of the distances of a device
 FRAMES = ('base', 'tool')
 IN_THE_CELL = (*FRAMES, ZERO)  # beside the arm
 ZEROS = ('joint', ZERO)
-FROM_THERE, BEFORE = 'from there on', 'before that'
+FROM_THERE, BEFORE_THAT = 'from there on', 'before that'
 OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
 
 
@@ -73,12 +73,12 @@ class Step:
     @property
     def _correction(self) -> str:
         """Return how to make distances before and after alike."""
-        after, parts = self.unused != BEFORE, []
+        after, parts = self.unused != BEFORE_THAT, []
         for wire, longer in self.longer.items():
             less = (longer > 0.0) == after
             how = ('subtract', 'from') if less else ('add', 'to')
             parts.append(f'{how[0]} {1e3 * abs(longer):.3g} mm {how[1]} the distances of {wire}')
-        return f'{" and ".join(parts)} {FROM_THERE if after else BEFORE}'
+        return f'{" and ".join(parts)} {FROM_THERE if after else BEFORE_THAT}'
 
     def told(self, number: int) -> str:
         """Return what moved in short, for an operator of the node who counts poses so."""

@@ -25,7 +25,7 @@ from calib_ros.decision.drift import slow_cosines
 from calib_ros.decision.imitations import LEAST, Imitation
 from calib_ros.decision.movable import Moving, groups_of, of_the_arm
 from calib_ros.decision.moved import (
-    BEFORE,
+    BEFORE_THAT,
     FROM_THERE,
     IN_THE_CELL,
     ZERO,
@@ -353,7 +353,7 @@ class _Scan:
             size, unit = turn, 'rad'
         weights = np.concatenate([self._weights[k] for k in group.sets])
         later = np.concatenate(after)
-        sides = (BEFORE, ~later), (FROM_THERE, later)
+        sides = (BEFORE_THAT, ~later), (FROM_THERE, later)
         most = largest_of(problem) if unit == 'm' else problem.largest_angle
         joints = np.concatenate([each.joints for each in sets])
         unused = [where for where, side in sides if found.stop and not weights[side].any()]

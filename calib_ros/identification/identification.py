@@ -90,8 +90,7 @@ def _identified(
     explained = simpler.validation.judged if simpler and simpler.validation else None
     progress(2 / 3)
     validation, validated_by = validate(fitted, before.chain, explained)
-    coarse = rounded_joints(problem)
-    share = coupling_share(fitted)
+    coarse, share = rounded_joints(problem), coupling_share(fitted)
     more, doubts = considered(chain, names, problem.fixed), rounding_errors(problem, coarse)
     inference = Inference(fitted, _size(fitted, share), more, doubts)
     posterior, uncertainty = _inferred(inference)
