@@ -138,6 +138,7 @@ class _Scan:
         self._chain = self._chain.with_effects(constant)
         zeros = [joint.driven for joint in problem.chain.joints]
         constant += [zero for zero in zeros if zero not in problem.free]
+        constant += dict.fromkeys(n for g in self._groups if g.kind == ZERO for n in g.names)
         names = (*names, *constant)
         self._fitted = len(names)
         self._added = list(dict.fromkeys(n for group in self._groups for n in group.names))
@@ -341,12 +342,8 @@ class _Scan:
         change = np.sqrt(((np.concatenate(moved) @ found.size[known]) ** 2).mean(axis=0))
         size, turn = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
         unit, oriented = 'm', any(each.turned for each in problem.sets)
-        longer = {}
-        if group.kind == ZERO:
-            longer = {
-                Parameter(name).owner: float(s)
-                for name, s in zip(group.names, found.size, strict=True)
-            }
+        sizes = zip(group.names, found.size.tolist(), strict=True)
+        longer = {Parameter(n).owner: zero for n, zero in sizes if Parameter(n).kind == ZERO}
         if group.kind in ZEROS:
             size, unit = float(np.abs(found.size).max()), Parameter(group.names[0]).unit
         elif oriented and turn * problem.sigma_position > size * problem.sigma_orientation:
@@ -386,13 +383,15 @@ def _separable(joints: FloatArray, after: Flags) -> bool:
 
 
 def _rows_of(system: System, chain: Chain, names: Sequence[str]) -> list[FloatArray]:
-    """Return the rows of a system as it does, also by zeros of distances, after all others."""
+    """Return the rows of a system as it does, also by zeros of distances."""
     zeros = [name for name in names if Parameter(name).kind == ZERO]
-    rows = system.rows_of(chain, names[: len(names) - len(zeros)])
+    others = [name for name in names if name not in zeros]
+    order = [[*others, *zeros].index(name) for name in names]
+    rows = system.rows_of(chain, others)
     for k, samples in enumerate(system.sets if zeros else ()):
         seen, own = samples.observations, np.zeros((len(zeros), *rows[k].shape[1:]))
         if seen.distances is not None and not seen.plane:
             weights = np.ones(len(seen)) if samples.weights is None else samples.weights
             own[zeros.index(Parameter(seen.base, ZERO))] = weights / samples.sigmas[0]
-        rows[k] = np.concatenate([rows[k][:-1], own, rows[k][-1:]])
+        rows[k] = np.concatenate([rows[k][:-1], own, rows[k][-1:]])[[*order, -1]]
     return rows
