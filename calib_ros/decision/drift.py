@@ -58,7 +58,7 @@ class Shifts:
             length = series.shape[1]
             circle = np.concatenate([series, series[:, ::-1], series], axis=1)
             every = sliding_window_view(circle, length, axis=1).swapaxes(0, 1)
-            starts = (np.arange(count) / count * 2 * length).astype(int)
+            starts = np.arange(count) * 2 * length // count
             moved = every[starts].reshape(count, -1)
             slow = moved.reshape(-1, length) @ slow_cosines(length).T
             self._energy += norms(moved) ** 2 - norms(slow.reshape(count, -1)) ** 2

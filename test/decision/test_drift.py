@@ -131,7 +131,7 @@ def slow_part(count):
     return basis @ basis.T
 
 
-@pytest.mark.parametrize('lengths', [(24,), (35, 12), (7,), (300,)])
+@pytest.mark.parametrize('lengths', [(24,), (49,), (35, 12), (7,), (300,)])
 def test_shares_are_those_of_fits_to_residuals_that_were_moved(lengths):
     """Every shift by itself, by least squares with priors; stops have one to three samples."""
     rng = np.random.default_rng(0)
@@ -160,7 +160,7 @@ def test_shares_are_those_of_fits_to_residuals_that_were_moved(lengths):
             sums = np.add.reduceat(np.vstack([residual[np.newaxis], column]), begins, axis=2)
             sums /= np.sqrt(repeat)
             circle = np.concatenate([sums[0], sums[0][:, ::-1]], axis=1)
-            by = int(2 * every * k / count)
+            by = 2 * every * k // count
             rest = np.eye(every) - slow_part(every)
             moved.append((np.roll(circle, -by, axis=1)[:, :every] @ rest).ravel())
             rows.append((sums[1:] @ rest).reshape(5, -1))
