@@ -21,8 +21,8 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[1] / 'test')]
 from photographs import rendered
 
 from calib_ros.files.boards import Board
-from calib_ros.files.cameras import decoded
 from calib_ros.files.detector import Detector
+from calib_ros.files.images import decoded
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.board_finder import Flaw

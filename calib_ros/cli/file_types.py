@@ -7,7 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from calib_ros.errors import InputError
-from calib_ros.files import cameras
+from calib_ros.files import images
 from calib_ros.files.loading import TABLES
 from calib_ros.files.unpacked import RECORDED
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES
@@ -24,7 +24,7 @@ KIND_OF_SUFFIX = {
     **dict.fromkeys((*RECORDED, '.bag'), 'bag'),
     **dict.fromkeys(URDF_SUFFIXES, 'urdf'),
     **dict.fromkeys(('.yaml', '.yml'), 'chain'),
-    **dict.fromkeys(cameras.SUFFIXES, 'image'),
+    **dict.fromkeys(images.SUFFIXES, 'image'),
     **dict.fromkeys(('.html', '.pdf', '.md', '.json'), 'report'),
     **dict.fromkeys(TABLES, 'table'),
     **dict.fromkeys(('.xls', '.xlsb', '.ods', '.numbers'), 'workbook'),

@@ -18,8 +18,8 @@ from calib_ros.cli.main import main
 from calib_ros.decision.suspects import NOT_ON_FLANGE
 from calib_ros.errors import CalibrationError, ConfigError, InputError
 from calib_ros.files import boards, lenses
-from calib_ros.files.cameras import decoded, read_image
 from calib_ros.files.detector import Detector, detect
+from calib_ros.files.images import decoded, read_image
 from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from calib_ros.files.cameras import grey
+from calib_ros.files.images import grey
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling import pictures
 from calib_ros.sampling.board_finder import Flaw
