@@ -43,8 +43,9 @@ from calib_ros.fleet import run as running
 from calib_ros.fleet.page import write_report
 from calib_ros.fleet.plant import read_plant
 from calib_ros.fleet.run import Cluster, run
+from calib_ros.fleet.source_files import sources
 from calib_ros.fleet.status import statuses
-from calib_ros.fleet.tasks import Outcome, Task, sources, work
+from calib_ros.fleet.tasks import Outcome, Task, work
 from calib_ros.kinematics.chain_file import load_chain
 
 POSES, BEFORE = 60, 3

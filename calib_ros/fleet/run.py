@@ -25,7 +25,8 @@ from calib_ros.errors import CalibrationError, ConfigError, shortened, trouble
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
-from calib_ros.fleet.tasks import Outcome, Task, sources, work
+from calib_ros.fleet.source_files import sources
+from calib_ros.fleet.tasks import Outcome, Task, work
 from calib_ros.identification.age import A_DAY, NEVER
 from calib_ros.progress import Notify, quiet
 

@@ -22,7 +22,8 @@ from calib_ros.cli.main import main
 from calib_ros.files.history import History
 from calib_ros.fleet.plant import read_plant
 from calib_ros.fleet.run import Cluster, LostError, _client, _done
-from calib_ros.fleet.tasks import SourceFile, Task
+from calib_ros.fleet.source_files import SourceFile
+from calib_ros.fleet.tasks import Task
 
 DASK = Path(sys.executable).with_name('dask')
 ONE = ('--nworkers', '1', '--nthreads', '1')

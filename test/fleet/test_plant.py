@@ -7,7 +7,7 @@ import pytest
 
 from calib_ros.errors import ConfigError
 from calib_ros.fleet.plant import Pattern, parse_plant, read_plant
-from calib_ros.fleet.tasks import sources
+from calib_ros.fleet.source_files import sources
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.settings import Settings
 

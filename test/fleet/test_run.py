@@ -18,8 +18,9 @@ from calib_ros.files.rows import Row
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import Pattern, read_plant
 from calib_ros.fleet.run import Cluster, LostError, Run, results, run, verifications
+from calib_ros.fleet.source_files import SourceFile, sources
 from calib_ros.fleet.status import statuses
-from calib_ros.fleet.tasks import Outcome, SourceFile, Task, sources
+from calib_ros.fleet.tasks import Outcome, Task
 from calib_ros.kinematics.chain_file import chain_document, load_chain
 
 CHAIN = json.dumps(chain_document(load_chain('ur10e')))
