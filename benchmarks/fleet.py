@@ -39,10 +39,11 @@ import psutil
 
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.files.history import History
-from calib_ros.fleet import run as running
+from calib_ros.fleet import cluster
+from calib_ros.fleet.cluster import Cluster
 from calib_ros.fleet.page import write_report
 from calib_ros.fleet.plant import read_plant
-from calib_ros.fleet.run import Cluster, run
+from calib_ros.fleet.run import run
 from calib_ros.fleet.source_files import sources
 from calib_ros.fleet.status import statuses
 from calib_ros.fleet.tasks import Outcome, Task, work
@@ -171,10 +172,10 @@ def by_processes(number, tasks):
 
 def by_workers(number, tasks):
     """Return what workers of dask make of tasks, and the time."""
-    with running._client(Cluster('', number)) as client:
-        list(running._done(client, tasks[:number], cpu))
+    with cluster.workers_of(Cluster('', number)) as client:
+        list(cluster.done_tasks(client, tasks[:number], cpu))
         begin = time.monotonic()
-        found = [outcome for _, outcome in running._done(client, tasks, cpu)]
+        found = [outcome for _, outcome in cluster.done_tasks(client, tasks, cpu)]
         return found, time.monotonic() - begin
 
 
@@ -210,10 +211,10 @@ def scheduler_part(folder, count):
     """Return the time of client and scheduler for each of many tasks of 0.1 s."""
     plant = read_plant(plants.write_plant(folder, ['R'], 1))
     tasks = [Task(plant[0], sources(plant[0])[0])] * count
-    with running._client(Cluster('', 2)) as client:
-        list(running._done(client, tasks[:50], nothing))
+    with cluster.workers_of(Cluster('', 2)) as client:
+        list(cluster.done_tasks(client, tasks[:50], nothing))
         begin, spent = time.monotonic(), time.process_time()
-        list(running._done(client, tasks, nothing))
+        list(cluster.done_tasks(client, tasks, nothing))
         span, spent = time.monotonic() - begin, time.process_time() - spent
         return {'cpu_ms': 1e3 * spent / count, 'idle_share': 1.0 - 0.1 * count / 2 / span}
 

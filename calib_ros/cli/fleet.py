@@ -19,9 +19,10 @@ from calib_ros.shown import counted
 
 
 def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.fleet.cluster import Cluster
     from calib_ros.fleet.page import metrics, write_report
     from calib_ros.fleet.plant import read_plant
-    from calib_ros.fleet.run import Cluster, run
+    from calib_ros.fleet.run import run
     from calib_ros.fleet.status import counts, statuses
 
     if not 0.0 < options.years < 1e9:

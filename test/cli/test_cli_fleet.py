@@ -18,7 +18,7 @@ from calib_ros.cli.common import Status
 from calib_ros.cli.main import main
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
-from calib_ros.fleet import run as running
+from calib_ros.fleet import cluster, run as running
 from calib_ros.fleet.plant import read_plant
 
 COMMON = ('--chain', 'ur10e', '--history', 'history', '--serial', '0042')
@@ -295,7 +295,7 @@ def test_what_cannot_be_asked_for(folder, capsys):
 
 
 def test_a_scheduler_that_is_lost_is_told_of(folder, capsys, monkeypatch):
-    monkeypatch.setattr(running, 'ANSWER_S', 0.5)
+    monkeypatch.setattr(cluster, 'ANSWER_S', 0.5)
     plants.write_plant(folder, ['A'], 1)
     command = ['fleet', 'plant.yaml', '--history', 'history', '--scheduler', 'tcp://127.0.0.1:1']
     assert main(command) == 1

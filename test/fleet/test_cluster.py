@@ -20,8 +20,8 @@ from distributed import LocalCluster
 
 from calib_ros.cli.main import main
 from calib_ros.files.history import History
+from calib_ros.fleet.cluster import Cluster, LostError, done_tasks, workers_of
 from calib_ros.fleet.plant import read_plant
-from calib_ros.fleet.run import Cluster, LostError, _client, _done
 from calib_ros.fleet.source_files import SourceFile
 from calib_ros.fleet.tasks import Task
 
@@ -112,7 +112,7 @@ def test_a_worker_near_its_limit_does_not_pause_for_ever():
     def paused(dask_worker):
         return dask_worker.memory_manager.memory_pause_fraction
 
-    with _client(Cluster(workers=1)) as client:
+    with workers_of(Cluster(workers=1)) as client:
         assert {*client.run(paused).values()} == {False}
 
 
@@ -120,9 +120,9 @@ def test_a_run_whose_workers_are_all_gone_ends(tmp_path, monkeypatch):
     """It waited without an end."""
     (robot,) = read_plant(plants.write_plant(tmp_path, ['A'], 0))
     local = LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=None)
-    with local, _client(Cluster(local.scheduler_address)) as client:
+    with local, workers_of(Cluster(local.scheduler_address)) as client:
         local.scale(0)
         until(lambda: not client.nthreads())
-        monkeypatch.setattr('calib_ros.fleet.run.ANSWER_S', 1.0)  # not before: a busy machine
+        monkeypatch.setattr('calib_ros.fleet.cluster.ANSWER_S', 1.0)  # not before: a busy machine
         with pytest.raises(LostError, match='no workers are left'):
-            next(_done(client, [Task(robot, SourceFile('a'))]))
+            next(done_tasks(client, [Task(robot, SourceFile('a'))]))

@@ -15,9 +15,10 @@ from fsspec.implementations.local import LocalFileSystem
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
-from calib_ros.fleet import run as running
+from calib_ros.fleet import cluster as clusters, run as running
+from calib_ros.fleet.cluster import Cluster, LostError
 from calib_ros.fleet.plant import Pattern, read_plant
-from calib_ros.fleet.run import Cluster, LostError, Run, results, run, verifications
+from calib_ros.fleet.run import Run, results, run, verifications
 from calib_ros.fleet.source_files import SourceFile, sources
 from calib_ros.fleet.status import statuses
 from calib_ros.fleet.tasks import Outcome, Task
@@ -360,8 +361,10 @@ def test_a_history_that_cannot_be_read_ends_the_run(plant, tmp_path, monkeypatch
 
 def test_the_task_that_ends_a_worker_is_found(plant, cluster):
     tasks = [Task(plant[0], SourceFile(str(number))) for number in range(200)]
-    with running._client(cluster) as client:
-        done = {task.source.url: found for task, found in running._done(client, tasks, echoed)}
+    with clusters.workers_of(cluster) as client:
+        done = {
+            task.source.url: found for task, found in clusters.done_tasks(client, tasks, echoed)
+        }
     assert len(done) == 200
     assert re.fullmatch(r'its worker ended, .*\(--memory\): 150', done.pop('150').error)
     assert all(outcome.error == url for url, outcome in done.items())
@@ -370,8 +373,8 @@ def test_the_task_that_ends_a_worker_is_found(plant, cluster):
 def test_a_scheduler_that_dies_is_told_of(plant):
     tasks = [Task(plant[0], SourceFile(str(number))) for number in range(50)]
     local = LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=':0')
-    with local, running._client(Cluster(local.scheduler_address)) as client:
-        found = running._done(client, tasks, echoed)
+    with local, clusters.workers_of(Cluster(local.scheduler_address)) as client:
+        found = clusters.done_tasks(client, tasks, echoed)
         next(found)
         local.close()
         with pytest.raises(LostError, match='results so far are saved; run again'):
@@ -396,6 +399,6 @@ def test_faults_of_ours_cost_their_source_only(plant, cluster, tmp_path, monkeyp
 
 
 def test_workers_of_another_version_are_refused(plant, cluster, tmp_path, monkeypatch):
-    monkeypatch.setattr(running, '_version', lambda: '0.0.1')
+    monkeypatch.setattr(clusters, '_version', lambda: '0.0.1')
     with pytest.raises(ConfigError, match=r'workers have calib_ros 0\.0\.1'):
         run(plant, History(tmp_path / 'history'), cluster)
