@@ -17,7 +17,8 @@ from calib_ros.estimation.levels import SEVERAL
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
-from calib_ros.fleet.run import Run, results, too_late, verifications
+from calib_ros.fleet.results import results, too_late, verifications
+from calib_ros.fleet.run import Run
 from calib_ros.fleet.watch import Watched, alarms_of, watch
 from calib_ros.report.content import State
 from calib_ros.shown import counted, some

@@ -18,7 +18,7 @@ from calib_ros.cli.common import Status
 from calib_ros.cli.main import main
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
-from calib_ros.fleet import cluster, run as running
+from calib_ros.fleet import cluster, results, run as running
 from calib_ros.fleet.plant import read_plant
 
 COMMON = ('--chain', 'ur10e', '--history', 'history', '--serial', '0042')
@@ -171,7 +171,7 @@ def test_sessions_of_a_table_are_nights_of_their_own(folder):
     assert [row.source for row in rows] == ['both.csv#0', 'both.csv#1']
     (robot,) = read_plant(Path('plant.yaml'))
     own = [replace(row, settings=robot.settings_hash) for row in rows]
-    assert len(running.results(robot, own)) == 2
+    assert len(results.results(robot, own)) == 2
 
 
 def test_an_impatient_operator_ends_a_fleet_in_good_order(folder, monkeypatch, capsys):

@@ -18,7 +18,8 @@ from calib_ros.files.rows import Row
 from calib_ros.fleet import cluster as clusters, run as running
 from calib_ros.fleet.cluster import Cluster, LostError
 from calib_ros.fleet.plant import Pattern, read_plant
-from calib_ros.fleet.run import Run, results, run, verifications
+from calib_ros.fleet.results import results, verifications
+from calib_ros.fleet.run import Run, run
 from calib_ros.fleet.source_files import SourceFile, sources
 from calib_ros.fleet.status import statuses
 from calib_ros.fleet.tasks import Outcome, Task
