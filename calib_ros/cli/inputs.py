@@ -22,7 +22,7 @@ from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files import loading, rows
+from calib_ros.files import hashes, loading, rows
 from calib_ros.files.bags import Replayed, replay
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.history import History
@@ -42,7 +42,7 @@ Unread: TypeAlias = dict[Path, list[tuple[str, int, int]]]
 
 def _files(paths: Iterable[Path]) -> Unread:
     """Return the files at some paths as they are now; those of a pipe are none."""
-    now = {path: [(str(file), file.stat()) for file in rows.files_of(path)] for path in paths}
+    now = {path: [(str(file), file.stat()) for file in hashes.files_of(path)] for path in paths}
     return {path: [(f, s.st_size, s.st_mtime_ns) for f, s in each] for path, each in now.items()}
 
 
@@ -85,18 +85,18 @@ def filing_of(
     *judged_by: object,
 ) -> rows.Filing:
     """Return what is filed with a result: by its files, or by the samples where these changed."""
-    settings = rows.settings_hash(nominal, settings_of(options), *judged_by)
+    settings = hashes.settings_hash(nominal, settings_of(options), *judged_by)
     measured, *_ = unread
-    read, changed = [rows.samples_hash(sets)], None
+    read, changed = [hashes.samples_hash(sets)], None
     if all(unread.values()) and unread == _files(unread):
-        read = [each.sha256 for each in rows.inputs_of(*unread)]
+        read = [each.sha256 for each in hashes.inputs_of(*unread)]
         changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
     for name in OF_TABLES[1:]:  # a session is told apart anyway
         value = vars(options).get(name)  # the same table in other units is another result
         read += [f'{name} {value}'] if value and not isinstance(value, Path) else []
     session = options.session or ''
     source = f'{measured}#{session}' if session else str(measured)
-    content = rows.content_hash(read, session)
+    content = hashes.content_hash(read, session)
     return rows.Filing(options.serial, measured_at(sets, changed), content, settings, source)
 
 
@@ -104,7 +104,7 @@ def origin_of(options: argparse.Namespace, inputs: Sequence[Path | None], **more
     """Return the origin of a result: the options, what `more` is known, and the files read."""
     chain = Path(options.chain)
     beside = (vars(options).get(name) for name in ('joints', 'places', 'board', 'intrinsics'))
-    read = rows.inputs_of(*inputs, *beside, chain if chain.is_file() else None)
+    read = hashes.inputs_of(*inputs, *beside, chain if chain.is_file() else None)
     people = {name: getattr(options, name, '') for name in OF_REPORTS}
     return Origin(read, command=options.typed, **people | more)
 

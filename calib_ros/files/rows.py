@@ -4,12 +4,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
-from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
@@ -21,11 +19,10 @@ from calib_ros.apply.judgement import Judgement
 from calib_ros.decision.residuals import ErrorFigures
 from calib_ros.decision.result import Identification
 from calib_ros.errors import LONGEST_NAME, ConfigError
-from calib_ros.estimation.observations import Observations
+from calib_ros.files.hashes import digest
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import chain_document, parse_chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 from calib_ros.values import parse_name
 
@@ -99,60 +96,6 @@ class Row(Shown, Filing):
     def corrected(self) -> Chain:
         """Return the corrected chain with its frames."""
         return parse_chain(self.chain, f'the chain of {self.serial} in the history')
-
-
-def digest(content: object) -> str:
-    """Return the SHA-256 of plain values."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def settings_hash(nominal: Chain, settings: Settings, *more: object) -> str:
-    """Return the hash of what a result depends on besides the measurements."""
-    return digest([chain_document(nominal), asdict(settings), *more])
-
-
-@dataclass(frozen=True)
-class Input:
-    """An input file."""
-
-    name: str
-    size: int
-    sha256: str
-
-
-def files_of(path: Path) -> list[Path]:
-    """Return a file, or those of a folder; none for a pipe, which cannot be read twice."""
-    return sorted(each for each in (path, *path.rglob('*')) if each.is_file())
-
-
-def inputs_of(*paths: Path | None) -> tuple[Input, ...]:
-    """Return all files at some paths, or in folders such as bags, with size and hash."""
-    found = []
-    for path in filter(None, paths):
-        for each in files_of(path):
-            digest = hashlib.sha256()
-            with each.open('rb') as file:
-                while block := file.read(1 << 20):
-                    digest.update(block)
-            name, size = str(each.relative_to(path.parent)), each.stat().st_size
-            found.append(Input(name, size, digest.hexdigest()))
-    return tuple(found)
-
-
-def content_hash(files: Sequence[str], session: str = '') -> str:
-    """Return the hash of files, by their own hashes, or of a session in them."""
-    return digest([session, *sorted(files)])
-
-
-def samples_hash(sets: Sequence[Observations]) -> str:
-    """Return the hash of samples without a file, by all that was measured."""
-    found = hashlib.sha256()
-    for each in sets:
-        for part in fields(each):
-            value = getattr(each, part.name)
-            data = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
-            found.update(data)
-    return found.hexdigest()
 
 
 def result_row(result: Identification, about: Filing, warnings: Sequence[str] = ()) -> Row:

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
-from calib_ros.files.rows import parse_serial, settings_hash
+from calib_ros.files.hashes import settings_hash
+from calib_ros.files.rows import parse_serial
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.settings import EXCEPTION, Settings

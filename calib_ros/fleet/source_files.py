@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from calib_ros.errors import CalibrationError, ConfigError, InputError
-from calib_ros.files import rows
+from calib_ros.files import hashes
 from calib_ros.files.history import is_local
 from calib_ros.files.loading import TABLES
 from calib_ros.files.unpacked import RECORDED
@@ -115,7 +115,7 @@ def _state(files: Any, path: str, info: dict[str, Any]) -> tuple[str, datetime |
         marks.append([name, part['size'], *map(str, dates + sums)])
         dates.append(part.get('date_time'))  # in archives (zip)
         times += [each for each in map(_moment, dates) if each is not None]
-    return rows.digest(marks), max(times, default=None)
+    return hashes.digest(marks), max(times, default=None)
 
 
 def _moment(value: object) -> datetime | None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from calib_ros.errors import CalibrationError, shortened
-from calib_ros.files import rows
+from calib_ros.files import hashes, rows
 from calib_ros.files.bags import replay
 from calib_ros.files.loading import TABLES, load_bag, load_table, table
 from calib_ros.fleet.plant import Robot
@@ -69,8 +69,8 @@ def _named(task: Task, path: Path | None, told: Sequence[str]) -> tuple[str, ...
 
 def _outcome(task: Task, path: Path) -> Outcome:
     robot, source = task.robot, task.source
-    inputs = rows.inputs_of(path)
-    content = rows.content_hash([each.sha256 for each in inputs], source.session)
+    inputs = hashes.inputs_of(path)
+    content = hashes.content_hash([each.sha256 for each in inputs], source.session)
     if content in task.known:
         return Outcome(known=task.known[content])
     chain, settings = robot.chain, robot.settings

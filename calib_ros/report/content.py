@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, TypeAlias
 
 import calib_ros
-from calib_ros.files.rows import Input
+from calib_ros.files.hashes import Input
 from calib_ros.report.refusals import Advice
 from calib_ros.shown import clipped
 

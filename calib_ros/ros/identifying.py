@@ -25,9 +25,10 @@ from calib_ros.errors import LONGEST, ConfigError, InputError, shortened, troubl
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
+from calib_ros.files.hashes import inputs_of, samples_hash, settings_hash
 from calib_ros.files.history import History
 from calib_ros.files.loading import Loaded
-from calib_ros.files.rows import Filing, Row, inputs_of, result_row, samples_hash, settings_hash
+from calib_ros.files.rows import Filing, Row, result_row
 from calib_ros.identification.age import measured_at
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain

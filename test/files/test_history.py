@@ -14,8 +14,9 @@ from fits import UR10E as CHAIN, measured_arm
 from calib_ros import Problem, Settings, identify
 from calib_ros.apply import simulation
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.files.hashes import samples_hash, settings_hash
 from calib_ros.files.history import History
-from calib_ros.files.rows import Filing, Row, result_row, samples_hash, settings_hash
+from calib_ros.files.rows import Filing, Row, result_row
 
 BEGIN = datetime(2026, 1, 31, 23, 30, 0, 123_456, timezone.utc)
 

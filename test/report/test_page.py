@@ -19,8 +19,8 @@ from calib_ros import Calibration, Problem, identify, verify
 from calib_ros.apply import simulation
 from calib_ros.apply.workspace import survey
 from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.files.hashes import Input
 from calib_ros.files.loading import Loaded
-from calib_ros.files.rows import Input
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice, page, refusals
 from calib_ros.report.content import Headline, Origin
