@@ -21,6 +21,7 @@ import numpy as np
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.columns import Columns, cell_number
 from calib_ros.files.conventions import to_our_columns
+from calib_ros.files.expressions import Expression
 from calib_ros.files.headers import (
     TURNS_LEFT,
     listed,
@@ -30,7 +31,7 @@ from calib_ros.files.headers import (
     only_index,
     places,
 )
-from calib_ros.files.layouts import Expression, Layout
+from calib_ros.files.layouts import Layout
 from calib_ros.files.names import in_doubt, like_joints, named_in, option, quaternions_in, turns_in
 from calib_ros.files.sheets import read_sheet
 from calib_ros.files.skipped import drop_unmeasured, without_statistics

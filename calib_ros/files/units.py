@@ -7,8 +7,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from calib_ros.errors import InputError
+from calib_ros.files.expressions import Expression
 from calib_ros.files.headers import name_and_unit
-from calib_ros.files.layouts import Expression, Layout
+from calib_ros.files.layouts import Layout
 from calib_ros.files.sheets import Sheet
 from calib_ros.files.vocabulary import (
     ANGLES,

@@ -11,8 +11,9 @@ from test_foreign import JOINTS, PLACES, text_of
 from calib_ros import Chain, Settings, read_table
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files import loading
+from calib_ros.files.expressions import Expression
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import Expression, Layout, layout_of, load_layout
+from calib_ros.files.layouts import Layout, layout_of, load_layout
 from calib_ros.kinematics.chain import Joint
 from calib_ros.kinematics.chain_file import load_chain, shared_files
 
