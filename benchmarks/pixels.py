@@ -106,7 +106,8 @@ def rendered_run(nominal, seed, images):
     sys.path[:0] = [str(Path(__file__).resolve().parents[1] / 'test')]
     from photographs import rendered
 
-    from calib_ros.files.boards import Board, observed
+    from calib_ros.files.boards import Board
+    from calib_ros.files.detections import observed
     from calib_ros.files.detector import detect
 
     rng = np.random.default_rng(seed)

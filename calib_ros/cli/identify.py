@@ -19,7 +19,7 @@ from calib_ros.decision.result import Identification
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations, frames_of_sets
 from calib_ros.estimation.problem import Problem
-from calib_ros.files import boards
+from calib_ros.files import boards, detections
 from calib_ros.files.lenses import read_lens
 from calib_ros.files.loading import Loaded, load_bag, load_table
 from calib_ros.files.rows import result_row as row_of
@@ -212,14 +212,14 @@ def _detected(
         if getattr(options, name) is None:
             raise InputError(f'--detections needs --{name}')
     board = boards.read_board(options.board)
-    found = boards.read_detections(options.detections, board)
+    found = detections.read_detections(options.detections, board)
     places, posed, left_out = boards.read_places(options.places, len(chain.joints))
     if posed != (chain.name == boards.POSED):
         raise InputError(
             f'{options.places} holds {"poses of the flange" if posed else "joint values"}: '
             + (f'give --chain {boards.POSED}' if posed else 'give the chain of the arm')
         )
-    seen, notes = boards.observed(found, board, places, options.eye_in_hand)
+    seen, notes = detections.observed(found, board, places, options.eye_in_hand)
     warnings = (*left_out, *notes)
     more: Sequence[Observations] = ()
     held_out: Sequence[Observations] = ()

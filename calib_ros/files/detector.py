@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.files.boards import Board, Detections, grid
+from calib_ros.files.boards import Board, grid
+from calib_ros.files.detections import Detections
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.board_finder import Flaw

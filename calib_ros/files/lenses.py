@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.boards import SIZE, Detections
+from calib_ros.files.detections import SIZE, Detections
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.texts import parse_yaml, read_text

@@ -17,7 +17,7 @@ from robots import DATA, needs_data
 from calib_ros.cli.main import main
 from calib_ros.decision.suspects import NOT_ON_FLANGE
 from calib_ros.errors import CalibrationError, ConfigError, InputError
-from calib_ros.files import boards, lenses
+from calib_ros.files import boards, detections, lenses
 from calib_ros.files.detector import Detector, detect
 from calib_ros.files.images import decoded, read_image
 from calib_ros.files.stored import LARGEST_IMAGE
@@ -214,7 +214,7 @@ def test_detections_that_are_none_are_refused(tmp_path, text, said):
     path = tmp_path / 'detections.csv'
     path.write_text(text)
     with pytest.raises(InputError, match=said):
-        boards.read_detections(path, CHARUCO)
+        detections.read_detections(path, CHARUCO)
 
 
 def test_joints_that_the_arm_does_not_have_are_told(tmp_path):
@@ -247,7 +247,7 @@ def test_intrinsics_of_other_images_are_refused(tmp_path):
         path.write_text(INTRINSICS.replace('image_', '' if size else 'image_'))  # plain keys too
         sized = ',width,height' if size else ''
         table.write_text(f'image,corner,u,v{sized}\na,0,{beyond},20{size}\na,1,5,5{size}\n')
-        found = boards.read_detections(table, CHARUCO)
+        found = detections.read_detections(table, CHARUCO)
         if said is None:
             assert lenses.read_lens(path, found).fx == 1352.02747
             continue
@@ -255,7 +255,7 @@ def test_intrinsics_of_other_images_are_refused(tmp_path):
             lenses.read_lens(path, found)
     table.write_text('image,corner,u,v,width,height\na,0,1,2,800,600\nb,0,1,2,640,480\n')
     with pytest.raises(InputError, match='images of 640 x 480 and 800 x 600 px'):
-        boards.read_detections(table, CHARUCO)
+        detections.read_detections(table, CHARUCO)
 
 
 def test_intrinsics_as_others_write_them(tmp_path):
@@ -392,6 +392,8 @@ def test_intrinsics_that_are_none_are_refused(tmp_path, text, said):
 def test_places_of_images_that_are_none_are_refused(tmp_path, text, said):
     (tmp_path / 'places.csv').write_text(text)
     (tmp_path / 'corners.csv').write_text('image,corner,u,v\na,0,1,2\n')
-    found = boards.read_detections(tmp_path / 'corners.csv', CHARUCO)
+    found = detections.read_detections(tmp_path / 'corners.csv', CHARUCO)
     with pytest.raises(InputError, match=said):
-        boards.observed(found, CHARUCO, boards.read_places(tmp_path / 'places.csv', 2)[0], False)
+        detections.observed(
+            found, CHARUCO, boards.read_places(tmp_path / 'places.csv', 2)[0], False
+        )

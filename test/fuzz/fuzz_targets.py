@@ -142,7 +142,8 @@ def lens(path):
 def detections(path):
     import numpy as np
 
-    from calib_ros.files.boards import observed, read_board, read_detections, read_places
+    from calib_ros.files.boards import read_board, read_places
+    from calib_ros.files.detections import observed, read_detections
 
     known = read_board(CORPUS / 'board' / 'seed0')
     with contextlib.suppress(CalibrationError):
