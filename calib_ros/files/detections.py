@@ -18,7 +18,7 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.shown import some
 from calib_ros.texts import csv_text, to_cell
 
-DETECTION_COLUMNS = ('image', 'corner', 'u', 'v')
+HEADER = ('image', 'corner', 'u', 'v')
 SIZE = ('width', 'height')  # optional columns: size of the images [px]
 
 
@@ -41,14 +41,12 @@ class Detections:
         numbers = zip(self.image.tolist(), self.corner.tolist(), self.pixels.tolist(), strict=True)
         rows = ((to_cell(self.names[k]), n, f'{u:.4f}', f'{v:.4f}') for k, n, (u, v) in numbers)
         size = self.size or ()
-        return csv_text(
-            [(*DETECTION_COLUMNS, *SIZE[: len(size)]), *((*row, *size) for row in rows)]
-        )
+        return csv_text([(*HEADER, *SIZE[: len(size)]), *((*row, *size) for row in rows)])
 
 
 def read_detections(path: Path, board: Board) -> Detections:
     """Read a table of corners of a board."""
-    found = read_columns(path, DETECTION_COLUMNS)
+    found = read_columns(path, HEADER)
     image, names = found.labels('image')
     corner, most = found.integers('corner'), len(board.corners)
     found.refuse(

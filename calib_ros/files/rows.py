@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is filed of a result in the history: its row, and hashes of what it depends on."""
+"""The row that is filed of a result in the history."""
 
 from __future__ import annotations
 

@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 
 from calib_ros.annotated import Count, Positive, as_annotated
-from calib_ros.errors import ColumnsError, InputError, UnknownNameError
-from calib_ros.files.columns import Codes, Columns, columns_of
+from calib_ros.errors import ColumnsError, InputError
+from calib_ros.files.columns import Columns, columns_of
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.headers import TURNS_LEFT, joints_left_out, name_and_unit, not_read
 from calib_ros.files.journal import columns, of_journal
-from calib_ros.files.measurements import Measurements, distinct_rows, measurements
+from calib_ros.files.measurements import Measurements, distinct_rows
 from calib_ros.files.names import in_doubt, like_joints, option, quaternions_in, turns_in
+from calib_ros.files.selection import select_rows, without_others
 from calib_ros.files.skipped import drop_unmeasured, without_statistics
 from calib_ros.files.vocabulary import MATRIX, POSITION, QUATERNION, TURNS, WORDS, joint_columns
-from calib_ros.kinematics.se3 import Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.dataset import Dataset, dataset_of
 from calib_ros.settings import Settings
@@ -63,9 +63,9 @@ def read_table(
     elif path.is_file():  # a pipe can be read once only
         read = of_journal(path, joints, progress)
     found, warnings = read or _of_csv(path, joints, progress)
-    found, more = _without_others(found)
+    found, more = without_others(found)
     warnings = (*warnings, *more)
-    rows, by_line = _select_rows(found, joints, sessions), 'stamp_ns' not in found.cells
+    rows, by_line = select_rows(found, joints, sessions), 'stamp_ns' not in found.cells
     return _dataset(rows, sigmas, eye_in_hand, warnings, by_line)
 
 
@@ -101,57 +101,6 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
         notes += turns_in(path, [name_and_unit(name)[0] for name in found.header])
     known = {*columns(joints), *TURNS, 'plane', f'q{joints + 1}'}
     return kept, (*notes, *not_read(path, [name for name in cells if name not in known]))
-
-
-def _without_others(found: Columns) -> tuple[Columns, tuple[str, ...]]:
-    """Return columns without those that only seem to be ours, and notes.
-
-    Trackers write the distance of each point beside its coordinates, and SpatialAnalyzer calls the
-    name of a point its target.
-    """
-    count, told = len(found.lines), dict[str, str]()
-    for name in ('target', 'device'):
-        if len(found.labels(name)[1]) == count > len(POSITION):
-            told[name] = 'has another name in each row: it is left out, as a name of poses'
-    for name in ('distance', 'plane') if 'x' in found.cells else ():
-        filled = ~found.blank(name)
-        if filled.any() and not (filled & found.blank('x')).any():
-            told[name] = 'is left out: x, y, z are in all of its rows'
-    if not told:
-        return found, ()
-    cells = {name: given for name, given in found.cells.items() if name not in told}
-    notes = (f'{found.path}: the column {name} {why}' for name, why in told.items())
-    return replace(found, cells=cells), tuple(notes)
-
-
-def _select_rows(found: Columns, joints: int, sessions: Sequence[str]) -> Measurements:
-    if not len(found.lines):
-        measurements(found, joints)  # names missing columns first
-        raise InputError(f'{found.path} has no rows')
-    if 'session' not in found.cells and sessions:
-        names = ', '.join(sessions)
-        raise InputError(f'{found.path} has no column "session" to choose "{names}" from')
-    rows = _rows_of(found.path, found.labels('session'), sessions)
-    every = np.array_equal(rows, np.arange(len(found.lines)))
-    return measurements(found if every else found.select(rows), joints)
-
-
-def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> Index:
-    numbers, known = labels
-    if not sessions and len(known) > 1:
-        named = ', '.join(filter(None, known))
-        blank = '; rows without one are left out: name it in each (merged cells: in the first)'
-        raise InputError(
-            f'{path} holds several sessions, choose one of {named} (or several, joined by commas, '
-            f'to fit them together){blank * ("" in known)}'
-        )
-    for k, name in enumerate(sessions):
-        if name in sessions[:k]:
-            raise InputError(f'session "{name}" is named twice')
-        if name not in known:
-            raise UnknownNameError(f'session in {path}', name, known)
-    wanted = [known.index(name) for name in sessions or known]
-    return np.concatenate([np.flatnonzero(numbers == place) for place in wanted])
 
 
 def _dataset(
@@ -193,5 +142,5 @@ def check_table(made: Columns) -> None:
             'chain with those joint names (--chain), or their separate table (--joints)'
         )
     sessions = made.texts('session') if 'session' in made.cells else ()
-    made, _ = _without_others(made)
-    _dataset(_select_rows(made, joints, tuple(dict.fromkeys(sessions))))
+    made, _ = without_others(made)
+    _dataset(select_rows(made, joints, tuple(dict.fromkeys(sessions))))
