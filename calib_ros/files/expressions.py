@@ -81,3 +81,8 @@ def _value(tree: ast.expr, terms: Sequence[FloatArray | float]) -> Any:
     if not isinstance(tree, ast.Name):
         raise ValueError(type(tree).__name__)
     return terms[int(tree.id[1:])]
+
+
+def in_their_names(text: str, known: Mapping[str, str]) -> str:
+    """Return an expression with our columns that are `known` written in theirs."""
+    return TOKEN.sub(lambda m: f'({known[m[4]]})' if m[4] in known else m[0], text)

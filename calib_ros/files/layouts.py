@@ -16,7 +16,7 @@ from typing import Any
 
 from calib_ros.annotated import check_fields
 from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
-from calib_ros.files.expressions import TOKEN
+from calib_ros.files.expressions import in_their_names
 from calib_ros.files.vocabulary import (
     ANGLES,
     IN_TURN,
@@ -122,11 +122,6 @@ def parse_columns(text: str) -> Iterator[tuple[str, str]]:
             yield ours, theirs
 
 
-def _in_their_names(text: str, known: Mapping[str, str]) -> str:
-    """Return an expression with our columns that are `known` written in theirs."""
-    return TOKEN.sub(lambda m: f'({known[m[4]]})' if m[4] in known else m[0], text)
-
-
 def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> Layout:
     """Return the layout of a preset, if any, with the given values on top.
 
@@ -150,6 +145,6 @@ def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> 
         for ours, theirs in parse_columns(text):
             if ours in defined:
                 known, defined = dict(merged), set()
-            merged[ours] = theirs if ours in WORDS else _in_their_names(theirs, known)
+            merged[ours] = theirs if ours in WORDS else in_their_names(theirs, known)
             defined.add(ours)
     return replace(layout, columns=merged, insisted=(*changes,), **changes)
