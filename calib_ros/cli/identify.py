@@ -22,7 +22,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.files import boards, detections
 from calib_ros.files.lenses import read_lens
 from calib_ros.files.loading import Loaded, load_bag, load_table
-from calib_ros.files.rows import result_row as row_of
+from calib_ros.files.result_rows import result_row as row_of
 from calib_ros.identification.age import refuse_older, years_since
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.identification.recalibrated import Recalibration

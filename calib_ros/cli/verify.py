@@ -18,7 +18,7 @@ from calib_ros.errors import InputError
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.programs import read_joints
-from calib_ros.files.rows import verification_row
+from calib_ros.files.result_rows import verification_row
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash

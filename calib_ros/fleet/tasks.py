@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from calib_ros.errors import CalibrationError, shortened
-from calib_ros.files import hashes, rows
+from calib_ros.files import hashes, result_rows, rows
 from calib_ros.files.bags import replay
 from calib_ros.files.loading import TABLES, load_bag, load_table, table
 from calib_ros.fleet.plant import Robot
@@ -84,7 +84,9 @@ def _outcome(task: Task, path: Path) -> Outcome:
     loaded = replace(loaded, warnings=_named(task, path, loaded.warnings))
     time_of = measured_at(loaded.problem.all_sets, source.modified)
     known = (content, robot.settings_hash, source.name, source.fingerprint)
-    row = rows.result_row(result, rows.Filing(robot.serial, time_of, *known), loaded.warnings)
+    row = result_rows.result_row(
+        result, rows.Filing(robot.serial, time_of, *known), loaded.warnings
+    )
     if not task.page:
         return Outcome(row)
     configuration = configuration_yaml(chain.name, settings)

@@ -28,7 +28,8 @@ from calib_ros.files.archive import Archive
 from calib_ros.files.hashes import inputs_of, samples_hash, settings_hash
 from calib_ros.files.history import History
 from calib_ros.files.loading import Loaded
-from calib_ros.files.rows import Filing, Row, result_row
+from calib_ros.files.result_rows import result_row
+from calib_ros.files.rows import Filing, Row
 from calib_ros.identification.age import measured_at
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain

@@ -31,7 +31,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.cameras import cameras_of
 from calib_ros.files.programs import read_joints
-from calib_ros.files.rows import verification_row
+from calib_ros.files.result_rows import verification_row
 from calib_ros.identification.age import years_since
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibration import recalibrate

@@ -16,7 +16,8 @@ from calib_ros.apply import simulation
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.hashes import samples_hash, settings_hash
 from calib_ros.files.history import History
-from calib_ros.files.rows import Filing, Row, result_row
+from calib_ros.files.result_rows import result_row
+from calib_ros.files.rows import Filing, Row
 
 BEGIN = datetime(2026, 1, 31, 23, 30, 0, 123_456, timezone.utc)
 

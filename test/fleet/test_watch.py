@@ -13,7 +13,8 @@ import pytest
 
 from calib_ros.apply import simulation
 from calib_ros.estimation.problem import Problem
-from calib_ros.files.rows import Filing, result_row
+from calib_ros.files.result_rows import result_row
+from calib_ros.files.rows import Filing
 from calib_ros.fleet.watch import alarms_of, watch
 from calib_ros.identification.age import drift_of
 from calib_ros.identification.identification import identify

@@ -18,7 +18,8 @@ from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.residuals import Residuals
 from calib_ros.estimation.noise import Noise
-from calib_ros.files.rows import Filing, verification_row
+from calib_ros.files.result_rows import verification_row
+from calib_ros.files.rows import Filing
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibrated import Recalibration
