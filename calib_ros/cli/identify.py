@@ -19,7 +19,7 @@ from calib_ros.decision.result import Identification
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations, frames_of_sets
 from calib_ros.estimation.problem import Problem
-from calib_ros.files import boards, detections
+from calib_ros.files import boards, detections, image_places
 from calib_ros.files.lenses import read_lens
 from calib_ros.files.loading import Loaded, load_bag, load_table
 from calib_ros.files.result_rows import result_row as row_of
@@ -173,8 +173,8 @@ def identified(
 
 def _loaded(options: argparse.Namespace, screen: Screen) -> Loaded:
     source = _source(options)
-    posed = options.chain == boards.POSED
-    chain = boards.posed_arm() if posed else load_chain(options.chain)
+    posed = options.chain == image_places.POSED
+    chain = image_places.posed_arm() if posed else load_chain(options.chain)
     settings = common.settings_of(options)
     touch = options.sigma_touch
     refuse_larger('sigma_touch', touch or 0.0, TOUCH_SIGMA)
@@ -213,11 +213,11 @@ def _detected(
             raise InputError(f'--detections needs --{name}')
     board = boards.read_board(options.board)
     found = detections.read_detections(options.detections, board)
-    places, posed, left_out = boards.read_places(options.places, len(chain.joints))
-    if posed != (chain.name == boards.POSED):
+    places, posed, left_out = image_places.read_places(options.places, len(chain.joints))
+    if posed != (chain.name == image_places.POSED):
         raise InputError(
             f'{options.places} holds {"poses of the flange" if posed else "joint values"}: '
-            + (f'give --chain {boards.POSED}' if posed else 'give the chain of the arm')
+            + (f'give --chain {image_places.POSED}' if posed else 'give the chain of the arm')
         )
     seen, notes = detections.observed(found, board, places, options.eye_in_hand)
     warnings = (*left_out, *notes)

@@ -17,7 +17,7 @@ from robots import DATA, needs_data
 from calib_ros.cli.main import main
 from calib_ros.decision.suspects import NOT_ON_FLANGE
 from calib_ros.errors import CalibrationError, ConfigError, InputError
-from calib_ros.files import boards, detections, lenses
+from calib_ros.files import boards, detections, image_places, lenses
 from calib_ros.files.detector import Detector, detect
 from calib_ros.files.images import decoded, read_image
 from calib_ros.files.stored import LARGEST_IMAGE
@@ -224,7 +224,7 @@ def test_joints_that_the_arm_does_not_have_are_told(tmp_path):
         (3, ()),
         (2, (f'{path}: the column q3 is left out: the arm has 2 joints',)),
     ):
-        places, posed, told = boards.read_places(path, joints)
+        places, posed, told = image_places.read_places(path, joints)
         assert (len(places['a.png']), posed, told) == (joints, False, said)
 
 
@@ -272,7 +272,7 @@ def test_intrinsics_as_others_write_them(tmp_path):
 def test_the_virtual_arm_is_where_the_flange_is(rng):
     rotations = se3.exp_rotation(rng.normal(size=(50, 3)))
     positions = rng.normal(size=(50, 3))
-    found = boards.posed_arm().forward(boards.joints_of_poses(positions, rotations))
+    found = image_places.posed_arm().forward(image_places.joints_of_poses(positions, rotations))
     np.testing.assert_allclose(found, se3.transform(rotations, positions), atol=1e-12)
 
 
@@ -395,5 +395,5 @@ def test_places_of_images_that_are_none_are_refused(tmp_path, text, said):
     found = detections.read_detections(tmp_path / 'corners.csv', CHARUCO)
     with pytest.raises(InputError, match=said):
         detections.observed(
-            found, CHARUCO, boards.read_places(tmp_path / 'places.csv', 2)[0], False
+            found, CHARUCO, image_places.read_places(tmp_path / 'places.csv', 2)[0], False
         )

@@ -142,8 +142,9 @@ def lens(path):
 def detections(path):
     import numpy as np
 
-    from calib_ros.files.boards import read_board, read_places
+    from calib_ros.files.boards import read_board
     from calib_ros.files.detections import observed, read_detections
+    from calib_ros.files.image_places import read_places
 
     known = read_board(CORPUS / 'board' / 'seed0')
     with contextlib.suppress(CalibrationError):
