@@ -9,7 +9,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from calib_ros.atomic import write_file
-from calib_ros.cli import common
+from calib_ros.cli import checks, common
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.inputs import calibration_of
 from calib_ros.cli.screen import Screen
@@ -43,7 +43,7 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
     from calib_ros.files.programs import program_of
 
     refuse_others(options.program, 'compensate', 'program', 'chain', 'table')
-    common.refuse_existing(options, options.out)
+    checks.refuse_existing(options, options.out)
     if options.out.exists() and options.out.samefile(options.program):
         raise InputError(
             '--out would overwrite the program: keep it, since compensating it twice is wrong'

@@ -8,7 +8,7 @@ import argparse
 from collections.abc import Iterator
 
 from calib_ros.atomic import write_file, write_together
-from calib_ros.cli import common
+from calib_ros.cli import checks
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
@@ -32,7 +32,7 @@ def _board(options: argparse.Namespace, screen: Screen) -> int:
     words = f'{board.type} {board.columns} x {board.rows}, {board.dictionary}; must measure '
     words += f'{printed}: print in true size (100 %)'
     described = options.out.with_suffix('.yaml')
-    common.refuse_existing(options, options.out, described)
+    checks.refuse_existing(options, options.out, described)
     drawn = {options.out: board_pdf(black, board.size, words)}
     write_together({**drawn, described: dump_yaml(content)}, overwrite=options.force)
     screen.say(f'wrote {options.out} and {described}: {printed}; measure the print')
@@ -40,8 +40,8 @@ def _board(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _images(options: argparse.Namespace, screen: Screen) -> int:
-    common.refuse_existing(options, options.out)
-    common.at_least(options, fewest=1)
+    checks.refuse_existing(options, options.out)
+    checks.at_least(options, fewest=1)
     board = read_board(options.board)
     with screen.work('looking for corners') as work:
         found, unused = detect(_pictures(options, work), board, options.fewest, screen.say)

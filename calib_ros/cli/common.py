@@ -12,8 +12,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from calib_ros.atomic import refuse_to_replace, whole_folder, write_files
-from calib_ros.errors import InputError
+from calib_ros.atomic import whole_folder, write_files
 from calib_ros.settings import Settings
 
 Group: TypeAlias = 'argparse.ArgumentParser | argparse._ArgumentGroup'
@@ -54,16 +53,6 @@ OF_TABLES = (
     *('detections', 'board', 'places', 'intrinsics', 'lens', 'joints_preset'),
 )
 
-NEEDS = {
-    '--previous': ('growth', 'new_base', 'new_tool'),
-    '--detections': ('board', 'places', 'intrinsics', 'lens'),
-    '--joints': ('joints_preset',),
-    '--tracker': ('axis', 'cone'),
-    '--urdf': ('base_link', 'tip_link'),
-    '--out': ('pdf',),
-}
-"""Options that do nothing without another one."""
-
 
 class Status(IntEnum):
     """Exit status if the input was used but the outcome is insufficient."""
@@ -71,31 +60,6 @@ class Status(IntEnum):
     NOT_ACCEPTED = 3
     INCOMPLETE = 4
     """Of a fleet: some measurements or results could not be used, and no robot needs a look."""
-
-
-def refuse(options: argparse.Namespace, names: Iterable[str], why: str) -> None:
-    """Refuse options that are not at their default, and tell why."""
-    for name in names:
-        if vars(options).get(name) != options.parser.get_default(name):
-            raise InputError(f'--{name.replace("_", "-")} {why}')
-
-
-def refuse_alone(options: argparse.Namespace) -> None:
-    """Refuse options without the one that they need."""
-    for needed, names in NEEDS.items():
-        if vars(options).get(needed[2:], '') is None:
-            refuse(options, names, f'needs {needed}')
-
-
-def refuse_ignored(options: argparse.Namespace, source: str) -> None:
-    """Refuse options that a bag, or a table, would ignore."""
-    if source == 'table':
-        of_bags = (n for title in SETTINGS if title.startswith('bags') for n in SETTINGS[title])
-        refuse(options, (*of_bags, 'frame_id', 'largest_loss'), 'does not apply to a table')
-    else:
-        instead = 'does not apply to a bag: add eye_in_hand=true to its --sources'
-        refuse(options, ('eye_in_hand',), instead)
-        refuse(options, OF_TABLES, 'does not apply to a bag')
 
 
 def complete_robots(prefix: str, **_: Any) -> list[str]:
@@ -132,34 +96,6 @@ def add_fields(group: Group, items: Iterable[Field[Any]]) -> None:
             metavar='NAME,...' if many else {float: 'X', int: 'N'}.get(kind, 'NAME'),
             help=text,
         )
-
-
-def at_least(options: argparse.Namespace, **lowest: float) -> None:
-    """Refuse options below their lowest value; missing ones pass."""
-    for name, least in lowest.items():
-        value = getattr(options, name)
-        if value is not None and not value >= least:
-            raise InputError(f'--{name} must be at least {least}, not {value}')
-
-
-def check_loss(options: argparse.Namespace) -> None:
-    """Refuse a largest loss that is no share."""
-    if not 0.0 <= options.largest_loss <= 1.0:
-        raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
-
-
-def check_tolerance(options: argparse.Namespace) -> None:
-    """Refuse a tolerance in another unit than mm."""
-    if options.tolerance is not None and not 0.0 < options.tolerance <= 100.0:
-        raise InputError(f'--tolerance must be between 0 and 100 mm, not {options.tolerance:g} mm')
-
-
-def refuse_existing(options: argparse.Namespace, *paths: Path) -> None:
-    """Refuse to overwrite files, or write to a missing folder, before any work."""
-    for path in paths:
-        if not path.parent.is_dir():
-            raise InputError(f'there is no folder {path.parent} to write {path.name} into')
-        refuse_to_replace(path, options.force, '--force')
 
 
 def settings_of(options: argparse.Namespace) -> Settings:

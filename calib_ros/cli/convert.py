@@ -9,7 +9,7 @@ import argparse
 import numpy as np
 
 from calib_ros.atomic import write_file
-from calib_ros.cli import common, inputs
+from calib_ros.cli import checks, common, inputs
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -26,7 +26,7 @@ from calib_ros.settings import Settings
 
 def _convert(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.table, 'import', 'table')
-    common.refuse_existing(options, options.out)
+    checks.refuse_existing(options, options.out)
     chain = None if options.chain is None else load_chain(options.chain)
     foreign = inputs.foreign_of(options, chain) or Foreign(Layout(), chain)
     with screen.work(f'converting {options.table.name}'):
@@ -83,7 +83,7 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
 
 def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.bag, 'bag2csv', 'bag')
-    common.refuse_existing(options, options.csv)
+    checks.refuse_existing(options, options.csv)
     chain = load_chain(options.chain)
     session, read = inputs.replayed_bag(options.bag, chain, common.settings_of(options), screen)
     screen.say(f'{read}; {session.account()}')

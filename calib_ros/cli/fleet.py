@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from calib_ros.atomic import write_file
-from calib_ros.cli import common
+from calib_ros.cli import checks, common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files.history import History
@@ -27,9 +27,9 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
 
     if not 0.0 < options.years < 1e9:
         raise InputError(f'--years must be positive, not {options.years:g}')
-    common.at_least(options, workers=0)
+    checks.at_least(options, workers=0)
     if options.scheduler:
-        common.refuse(options, ('workers', 'memory'), 'does not apply to workers of a --scheduler')
+        checks.refuse(options, ('workers', 'memory'), 'does not apply to workers of a --scheduler')
     robots = read_plant(options.plant)
     history = History(options.history)
     cluster = Cluster(options.scheduler, options.workers, options.memory)

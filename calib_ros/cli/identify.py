@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from calib_ros.cli import common, inputs
+from calib_ros.cli import checks, common, inputs
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import GOOD_OR_BAD, Screen
 from calib_ros.decision.comparison import Comparison
@@ -49,10 +49,10 @@ NOT_OF_UPDATES = ('history', 'tolerance', 'model', 'fixed', 'priors', 'folds')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    common.check_tolerance(options)
-    common.check_loss(options)
+    checks.check_tolerance(options)
+    checks.check_loss(options)
     if options.previous is not None:
-        common.refuse(options, NOT_OF_UPDATES, 'does not apply to --previous')
+        checks.refuse(options, NOT_OF_UPDATES, 'does not apply to --previous')
         return _recalibrated(options, screen)
     filed = inputs.history_of(options)
     with common.output_files(options, (*RESULT_FILES, 'report.pdf')) as contents:
@@ -86,7 +86,7 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         loaded = _loaded(options, screen)
         if loaded.refusals:
             raise InputError('; '.join(loaded.refusals))
-        common.at_least(options, growth=0)
+        checks.at_least(options, growth=0)
         previous = inputs.calibration_of(
             options.previous, 'identify --previous', loaded.problem.chain
         )
@@ -197,7 +197,7 @@ def _source(options: argparse.Namespace) -> str:
     source = 'table' if options.csv or options.detections else 'bag'
     if (options.measured is None) == (source == 'bag'):
         raise InputError('give a bag, or a table or --detections FILE (or both of these)')
-    common.refuse_ignored(options, source)
+    checks.refuse_ignored(options, source)
     return source
 
 

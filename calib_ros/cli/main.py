@@ -29,8 +29,9 @@ from typing import NoReturn
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
+from calib_ros.cli.checks import refuse_alone
 from calib_ros.cli.commands import COMMANDS, add_options
-from calib_ros.cli.common import OF_REPORTS, refuse_alone
+from calib_ros.cli.common import OF_REPORTS
 from calib_ros.cli.screen import Screen, help_width, wrap_line, wrapped
 from calib_ros.errors import CalibrationError, UnknownNameError, near, shortened, trouble
 

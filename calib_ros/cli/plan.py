@@ -17,7 +17,7 @@ from calib_ros.apply.iso_9283 import iso_9283_poses
 from calib_ros.apply.planning import Plan
 from calib_ros.apply.simulation import measure
 from calib_ros.atomic import write_together
-from calib_ros.cli import common, inputs
+from calib_ros.cli import checks, common, inputs
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.problem import Problem
@@ -124,18 +124,18 @@ def _measurement(
 
 def _check(options: argparse.Namespace) -> None:
     if options.iso9283:
-        common.refuse(options, (*NOT_OF_TESTS, 'velocity'), 'does not apply to --iso9283')
+        checks.refuse(options, (*NOT_OF_TESTS, 'velocity'), 'does not apply to --iso9283')
     if options.candidates is not None:
-        common.refuse(options, ('draw',), 'does not apply to --candidates')
+        checks.refuse(options, ('draw',), 'does not apply to --candidates')
     if options.box is None and options.tracker is None:
-        common.refuse(options, ('world',), 'needs --box or --tracker')
-    common.at_least(options, poses=1, draw=1, seed=0, apart=0)
+        checks.refuse(options, ('world',), 'needs --box or --tracker')
+    checks.at_least(options, poses=1, draw=1, seed=0, apart=0)
     if options.accuracy is not None and not options.accuracy > 0.0:
         raise InputError(f'--accuracy must be positive, not {options.accuracy}')
     if not all(value > 0.0 for value in options.velocity):
         raise InputError('each --velocity must be positive')
     if options.out is not None:
-        common.refuse_existing(options, options.out, _page_beside(options.out))
+        checks.refuse_existing(options, options.out, _page_beside(options.out))
 
 
 def _page_beside(path: Path) -> Path:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.atomic import write_file
-from calib_ros.cli import common
+from calib_ros.cli import checks
 from calib_ros.cli.screen import Screen
 from calib_ros.kinematics import chain_file
 
@@ -42,7 +42,7 @@ def _chain(options: argparse.Namespace, screen: Screen) -> int:
         for key in ('base', 'tool'):
             text += f'# {key}: {json.dumps(frames[key] | {"fixed": True})}\n'
     else:
-        common.refuse(options, names, 'applies only to a URDF')
+        checks.refuse(options, names, 'applies only to a URDF')
         text = chain_file.dump_chain(chain_file.load_chain(options.robot))
     if options.out is None:
         screen.data(text.rstrip('\n'))

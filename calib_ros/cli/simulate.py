@@ -12,7 +12,7 @@ import numpy as np
 from calib_ros.apply.program import approaches
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.atomic import whole_folder, write_files
-from calib_ros.cli import common, inputs
+from calib_ros.cli import checks, common, inputs
 from calib_ros.cli.identify import RESULT_FILES, identified, result_files, show
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import load_bag
@@ -55,7 +55,7 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
 def _write_simulation(
     chain: Chain, options: argparse.Namespace, bag: Path, screen: Screen
 ) -> Path:
-    common.at_least(options, poses=1, seed=0)
+    checks.at_least(options, poses=1, seed=0)
     rng, cell = np.random.default_rng(options.seed), Cell()
     true = faulty(chain, cell, rng)
     configurations = chain.random_joints(options.poses, rng)

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from calib_ros.apply.verification import verify
 from calib_ros.apply.verified import Verification
-from calib_ros.cli import common, inputs
+from calib_ros.cli import checks, common, inputs
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import GOOD_OR_BAD, Screen
 from calib_ros.decision.reasons import Rule
@@ -39,8 +39,8 @@ VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     screen.quiet = screen.quiet or options.json
-    common.check_loss(options)
-    common.check_tolerance(options)
+    checks.check_loss(options)
+    checks.check_tolerance(options)
     with common.output_files(options, VERIFICATION_FILES) as contents:
         status, file = _verified(options, screen, contents)
     if options.out is not None:
@@ -133,7 +133,7 @@ def _sets(
     """Return the sets between the calibration's frames of their devices and targets."""
     settings = common.settings_of(options)
     kind = refuse_others(options.measured, 'verify', 'table', 'bag')
-    common.refuse_ignored(options, kind)
+    checks.refuse_ignored(options, kind)
     if kind == 'table':
         given = options.measured, nominal, settings, screen, options.eye_in_hand
         found = inputs.table_of(options, *given)

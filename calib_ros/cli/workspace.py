@@ -11,7 +11,7 @@ import numpy as np
 from calib_ros.apply import placement, workspace
 from calib_ros.apply.task import task_of
 from calib_ros.apply.workspace import Survey, in_base, regions
-from calib_ros.cli import common, inputs
+from calib_ros.cli import checks, common, inputs
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.programs import csv_of, joints_csv, read_poses
@@ -29,9 +29,9 @@ OF_PLACEMENT = ('region', 'aim', 'model', 'cells', 'turns')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    common.at_least(options, poses=100, cells=1, turns=1, seed=0)
+    checks.at_least(options, poses=100, cells=1, turns=1, seed=0)
     if options.task is None and options.joint_box is None:
-        common.refuse(options, OF_PLACEMENT, 'needs --task or --joint-box')
+        checks.refuse(options, OF_PLACEMENT, 'needs --task or --joint-box')
     with common.output_files(options, WORKSPACE_FILES + PLACEMENT_FILES) as contents:
         contents |= _files(options, screen)
     screen.say(common.written(options.out, contents))
