@@ -277,14 +277,14 @@ TARGETS['message'] = message
 
 def settings(data):
     """Options of identify, one in a line."""
-    from calib_ros.cli import main
+    from calib_ros.cli import parser
     from calib_ros.cli.common import settings_of
     from calib_ros.sampling.session import CalibrationSession
 
     lines = data.decode(errors='replace').replace('\0', '').split('\n')
     with contextlib.suppress(SystemExit):
         given = ['identify', 'bag', '--chain', 'ur10e', *lines]
-        CalibrationSession(ARM, settings_of(main._parser(given).parse_args(given)))
+        CalibrationSession(ARM, settings_of(parser.parser_of(given).parse_args(given)))
 
 
 TARGETS['settings'] = settings
