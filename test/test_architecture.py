@@ -38,7 +38,7 @@ ONLY = {
     'pyarrow': ('files.history',),
     'fsspec': ('files.history', 'fleet.'),
     **dict.fromkeys(('dask', 'distributed'), ('fleet.',)),
-    'rich': ('fleet.', 'cli.screen'),
+    'rich': ('fleet.', 'cli.screen', 'cli.terminal'),
     'argcomplete': ('cli.main',),
     'yaml': ('texts', 'ros.arguments', 'ros.command_line'),
 }

@@ -15,7 +15,7 @@ from typing import NoReturn
 
 from calib_ros import __version__
 from calib_ros.cli.commands import COMMANDS, add_options
-from calib_ros.cli.screen import help_width, wrap_line, wrapped
+from calib_ros.cli.terminal import help_width, wrap_line, wrapped
 from calib_ros.errors import near
 
 WAY = (
