@@ -147,8 +147,7 @@ def _sets(
             if lost[0].rule is not Rule.DROPPED:
                 told += '. First copy the bag again from the computer that made it'
             raise InputError(told)
-        found = dataset_of(session.usable, settings.sigmas)
-        found = replace(found, warnings=read.warnings)
+        found = replace(dataset_of(session.usable, settings.sigmas), warnings=read.warnings)
     names = arm.frames_of(found.owners)
     sets = [each.between(names) for each in (*found.fitted, *found.held_out)]
     return sets, found.warnings, found.by_line
