@@ -4,30 +4,25 @@
 
 from __future__ import annotations
 
-import importlib
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from enum import IntEnum
-from functools import cache
 from mmap import mmap
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
-from calib_ros.errors import InputError
+from calib_ros.files.compression import Room, decompressed
 from calib_ros.texts import LARGEST_TABLE
 
 MAGIC = b'\x89MCAP0\r\n'
-ZSTD = b'\x28\xb5\x2f\xfd'  # begins what zstd compressed
 _HEAD = struct.Struct('<BQ')  # kind and size
 _LOGGED = struct.Struct('<HIQQ')  # channel, sequence, log time, publish time
 MESSAGE_HEAD = _LOGGED.size
 _CHUNK = struct.Struct('<QQQI')  # first and last log time, uncompressed size and checksum
 FOOTER = _HEAD.size + struct.calcsize('<QQI') + len(MAGIC)
 """Bytes of the last record, with the place of the index, and of the magic."""
-MODULES = {'lz4': ('lz4.frame',), 'zstd': ('compression.zstd', 'backports.zstd', 'zstandard')}
 Channel = TypeVar('Channel')
 Content: TypeAlias = 'bytes | mmap'
 
@@ -42,22 +37,6 @@ class Opcode(IntEnum):
     CHUNK_INDEX = 0x08
     STATISTICS = 0x0B
     DATA_END = 0x0F
-
-
-class Room:
-    """Bytes that may still be unpacked of a recording: a chunk and 1,000 times its size.
-
-    No recorder compresses more; beyond it raises InputError.
-    """
-
-    def __init__(self, packed: int) -> None:
-        self._left = LARGEST_TABLE + 1000 * packed
-
-    def take(self, size: int) -> None:
-        """Count bytes to unpack."""
-        self._left -= size
-        if self._left < 0:
-            raise InputError('it unpacks to 1000 times its size')
 
 
 def is_indexed(file: Path) -> bool:
@@ -135,33 +114,9 @@ def string(record: bytes, start: int) -> str:
     return record[start + 4 : start + 4 + size].decode()
 
 
-def decompressed(data: bytes, compression: str, largest: int) -> bytes:
-    """Return decompressed data, as much as there is."""
-    module: Any = module_of(compression) if compression else None
-    found = data
-    if compression == 'lz4':
-        found = module.LZ4FrameDecompressor().decompress(data, largest + 1)
-    elif hasattr(module, 'ZstdCompressionDict'):  # zstandard
-        found = module.ZstdDecompressor().stream_reader(data).read(largest + 1)
-    elif compression:
-        found = module.ZstdDecompressor().decompress(data, largest + 1)
-    if len(found) > largest:
-        raise ValueError(f'it unpacks to more than the {largest} bytes that it may have')
-    return found
-
-
 def _unpacked(chunk: bytes) -> bytes:
     size = _CHUNK.unpack_from(chunk)[2]
     if size > LARGEST_TABLE:
         raise ValueError(f'a chunk has {size} bytes, more than {LARGEST_TABLE}')
     compression = string(chunk, _CHUNK.size)
     return decompressed(chunk[_CHUNK.size + 12 + len(compression) :], compression, size)
-
-
-@cache  # searching a missing module takes ten times as long as a message
-def module_of(compression: str) -> Any:
-    """Return the decompression module: one of those that rosbags requires."""
-    for name in MODULES.get(compression, ()):
-        with suppress(ImportError):
-            return importlib.import_module(name)
-    raise OSError(f'no module to decompress {compression}')

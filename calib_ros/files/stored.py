@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError
-from calib_ros.files import mcap
+from calib_ros.files import compression, mcap
 from calib_ros.files.unpacked import recorded_files
 from calib_ros.sampling.messages import PICTURES
 from calib_ros.sampling.streams import Stream
@@ -223,9 +223,9 @@ def _unpacked(messages: Iterator[tuple[Stream, bytes]]) -> Iterator[tuple[Stream
     """
     for stream, data in messages:
         most = LARGEST_IMAGE if stream.type in PICTURES else LARGEST_MESSAGE
-        if isinstance(data, bytes) and data.startswith(mcap.ZSTD):
+        if isinstance(data, bytes) and data.startswith(compression.ZSTD):
             try:
-                data = mcap.decompressed(data, 'zstd', most)
+                data = compression.decompressed(data, 'zstd', most)
             except OSError:  # no decompression module
                 raise
             except Exception:  # decompressors have their own errors
@@ -261,7 +261,7 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
             raise ValueError(whole.problem)
         return
     with storage.path.open('rb') as file:
-        room = mcap.Room(storage.path.stat().st_size)
+        room = compression.Room(storage.path.stat().st_size)
         problem: Exception | None = None
         for overlapping in _chunk_groups(storage.chunks, channels):
             found: list[tuple[int, Stream, bytes]] = []

@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files import mcap
+from calib_ros.files import compression
 from calib_ros.texts import read_text
 
 UNPACKED = ('.mcap', '.db3')  # suffixes of the files of a recording
@@ -76,9 +76,9 @@ def _with_log(file: Path, target: Path) -> None:
 
 
 def _unpack_file(file: Path, target: Path) -> None:
-    room = mcap.Room(file.stat().st_size)
+    room = compression.Room(file.stat().st_size)
     try:
-        with target.open('wb') as out, mcap.module_of('zstd').open(file, 'rb') as packed:
+        with target.open('wb') as out, compression.module_of('zstd').open(file, 'rb') as packed:
             while part := packed.read(1 << 20):
                 room.take(len(part))
                 out.write(part)

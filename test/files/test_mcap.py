@@ -15,7 +15,8 @@ import pytest
 from hypothesis import given, strategies as st
 
 from calib_ros.errors import InputError
-from calib_ros.files.mcap import Opcode, Room, logged, module_of, records
+from calib_ros.files.compression import Room, module_of
+from calib_ros.files.mcap import Opcode, logged, records
 from calib_ros.texts import LARGEST_TABLE
 
 try:
