@@ -13,8 +13,9 @@ from calib_ros.decision.changes import Explanation
 from calib_ros.files.rows import Row
 from calib_ros.fleet.page import fleet_page
 from calib_ros.fleet.plant import Pattern, Robot
+from calib_ros.fleet.robot_status import RobotStatus
 from calib_ros.fleet.run import Run
-from calib_ros.fleet.status import STATES, RobotStatus, counts
+from calib_ros.fleet.status import STATES, counts
 from calib_ros.fleet.watch import Change, Night, Watched
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.parameter import Parameter
