@@ -34,7 +34,8 @@ from calib_ros.files.headers import (
 from calib_ros.files.layouts import Layout
 from calib_ros.files.names import in_doubt, like_joints, named_in, option, quaternions_in, turns_in
 from calib_ros.files.sheets import read_sheet
-from calib_ros.files.skipped import drop_unmeasured, without_statistics
+from calib_ros.files.skipped import drop_unmeasured
+from calib_ros.files.summary_rows import without_statistics
 from calib_ros.files.units import Units
 from calib_ros.files.vocabulary import (
     IN_TURN,

@@ -28,7 +28,8 @@ from calib_ros.files.columns import (
 from calib_ros.files.headers import name_and_unit, only_index, places
 from calib_ros.files.layouts import Layout
 from calib_ros.files.names import groups
-from calib_ros.files.skipped import refuse_nominal, without_statistics, without_words
+from calib_ros.files.skipped import refuse_nominal, without_words
+from calib_ros.files.summary_rows import without_statistics
 from calib_ros.files.vocabulary import (
     DECIMAL_COMMA,
     MISSING,

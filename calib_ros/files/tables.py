@@ -26,7 +26,8 @@ from calib_ros.files.journal import columns, of_journal
 from calib_ros.files.measurements import Measurements, distinct_rows
 from calib_ros.files.names import in_doubt, like_joints, option, quaternions_in, turns_in
 from calib_ros.files.selection import select_rows, without_others
-from calib_ros.files.skipped import drop_unmeasured, without_statistics
+from calib_ros.files.skipped import drop_unmeasured
+from calib_ros.files.summary_rows import without_statistics
 from calib_ros.files.vocabulary import MATRIX, POSITION, QUATERNION, TURNS, WORDS, joint_columns
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.dataset import Dataset, dataset_of
