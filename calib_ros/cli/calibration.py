@@ -78,7 +78,8 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
 def _export(options: argparse.Namespace, screen: Screen) -> int:
     from calib_ros.files.export import CORRECTED_URDF, FILES, exports, urdf_export
     from calib_ros.files.programs import read_joints
-    from calib_ros.files.vendors import UR, VENDOR_FILES, vendor_files
+    from calib_ros.files.vendor_files import vendor_files
+    from calib_ros.files.vendors import UR, VENDOR_FILES
 
     nominal = load_chain(options.chain)
     calibration = calibration_of(options.calibration, 'export', nominal)

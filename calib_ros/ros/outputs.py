@@ -18,7 +18,7 @@ from calib_ros.atomic import confined, given_path, write_file
 from calib_ros.errors import InputError, trouble
 from calib_ros.files.archive import Archive
 from calib_ros.files.export import exports, urdf_export
-from calib_ros.files.vendors import vendor_files
+from calib_ros.files.vendor_files import vendor_files
 from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics.chain_file import chain_text, parse_chain
 from calib_ros.kinematics.se3 import FloatArray

@@ -13,7 +13,7 @@ from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.errors import ConfigError
 from calib_ros.files import vendors
 from calib_ros.files.export import ExportError, converted
-from calib_ros.files.vendors import vendor_files
+from calib_ros.files.vendor_files import vendor_files
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.kinematics.corrected_urdf import corrected_urdf
@@ -178,7 +178,9 @@ def test_the_hash_is_that_of_the_robot_or_of_the_numbers():
 
 def test_a_file_that_differs_is_refused(monkeypatch):
     nominal = load_chain('ur10e')
-    monkeypatch.setattr(vendors.export, 'xyz_rpy', lambda matrix: dict.fromkeys(NUMBERS, 0.0))
+    monkeypatch.setattr(
+        'calib_ros.files.export.xyz_rpy', lambda matrix: dict.fromkeys(NUMBERS, 0.0)
+    )
     with pytest.raises(ExportError, match=r'ur_kinematics\.yaml, read back, differs'):
         vendor_files(nominal, nominal)
 
