@@ -7,11 +7,9 @@ Guesses (encoding, separator, decimal sign, header line) are reported.
 
 from __future__ import annotations
 
-import codecs
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import accumulate, chain, islice, zip_longest
 from pathlib import Path
@@ -25,6 +23,7 @@ from calib_ros.files.columns import (
     from_rows,
     lines_in_words,
 )
+from calib_ros.files.encodings import WESTERN, text_and_encoding
 from calib_ros.files.headers import name_and_unit, only_index, places
 from calib_ros.files.layouts import Layout
 from calib_ros.files.names import groups
@@ -42,9 +41,7 @@ from calib_ros.files.vocabulary import (
 )
 from calib_ros.files.workbooks import sheets_of
 from calib_ros.shown import some
-from calib_ros.texts import LARGEST_TABLE, read_bytes
 
-WESTERN = ('Windows-1252', 'Latin-1')  # the last has all bytes
 HEAD_LINES = MOST_ENTRIES // 10
 """Lines searched for the header and the first row of numbers."""
 
@@ -116,7 +113,7 @@ def read_sheet(
 
 
 def _of_text(path: Path, layout: Layout) -> _Content:
-    text, coding = _text(path)
+    text, coding = text_and_encoding(path)
     told = f'the text is read as {coding}, because it is not UTF-8'
     notes = [told] if coding in WESTERN else []
     if '\r' in text:
@@ -231,7 +228,7 @@ def refuse_short(columns: Columns, last: str) -> None:
 
 def text_and_separator(path: Path) -> tuple[str, str, str]:
     """Return the text of a table, the sign between its cells, and the encoding."""
-    text, coding = _text(path)
+    text, coding = text_and_encoding(path)
     separator = SEPARATORS[_separator(path, text)]
     narrow = _narrow(text, separator)
     if separator in narrow.lstrip().partition('\n')[0]:
@@ -286,26 +283,6 @@ def _over_groups(cells: Sequence[str], width: int) -> list[str]:
         return []
     whole: Iterator[str] = accumulate(cells, lambda before, cell: cell or before)
     return [*whole]
-
-
-def _text(path: Path) -> tuple[str, str]:
-    """Return the text of a table and its encoding, by which all of its bytes are written again."""
-    data = read_bytes(path, LARGEST_TABLE, InputError)
-    if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
-        try:
-            return data.decode('utf-16'), 'utf-16'
-        except UnicodeDecodeError as err:
-            raise InputError(f'cannot read {path}: {err}') from err
-    if b'\0' in data:
-        told = 'is not text, and not a workbook by its name: save it as .xlsx or CSV'
-        if path.suffix.lower() in SHEETS:
-            told = 'is a workbook, expected a table as text: save the sheet as CSV'
-        raise InputError(f'cannot read {path}: it {told}')
-    marked = data.startswith(codecs.BOM_UTF8)
-    for coding in ('utf-8-sig' if marked else 'utf-8', *WESTERN[:-1]):
-        with suppress(UnicodeDecodeError):
-            return data.decode(coding), coding
-    return data.decode(WESTERN[-1]), WESTERN[-1]
 
 
 def _separator(path: Path, text: str) -> str:
