@@ -18,7 +18,7 @@ from calib_ros.errors import (
 )
 from calib_ros.files.detector import Image, opencv
 from calib_ros.files.stored import LARGEST_IMAGE
-from calib_ros.sampling.pictures import Flaw
+from calib_ros.sampling.board_finder import Flaw
 
 SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm')
 ENCODINGS = {'mono8': (1, ''), '8UC1': (1, ''), 'rgb8': (3, 'RGB'), 'bgr8': (3, 'BGR')}

@@ -13,7 +13,7 @@ import numpy as np
 
 from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.judgement import Judgement
-from calib_ros.decision.comparison import ErrorFigures
+from calib_ros.decision.residuals import ErrorFigures
 from calib_ros.decision.result import Identification
 from calib_ros.files.rows import Filing, Row
 from calib_ros.kinematics.chain import Chain
