@@ -22,10 +22,9 @@ import plants
 import pytest
 from measured import TEST, TRUE, UR, measured, rows_of, write_csv
 
-from calib_ros.cli import screen
+from calib_ros.cli import parser, screen
 from calib_ros.cli.commands import COMMANDS
 from calib_ros.cli.main import main
-from calib_ros.cli.parser import parser_of
 from calib_ros.cli.screen import Work
 from calib_ros.files.boards import read_board
 
@@ -153,7 +152,7 @@ def test_the_examples_of_a_help_are_right(name):
     for example in COMMANDS[name].examples:
         given = shlex.split(example)
         assert given[0] == name
-        assert parser_of(given).parse_args(given)
+        assert parser.parser_of(given).parse_args(given)
 
 
 RESULTS = {

@@ -14,9 +14,9 @@ from fsspec.implementations.local import LocalFileSystem
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.history import History
+from calib_ros.files.loading import table
 from calib_ros.files.rows import Row
-from calib_ros.fleet import cluster as clusters, run as running
-from calib_ros.fleet.cluster import Cluster, LostError
+from calib_ros.fleet.cluster import Cluster, LostError, done_tasks, workers_of
 from calib_ros.fleet.plant import Pattern, read_plant
 from calib_ros.fleet.results import results, verifications
 from calib_ros.fleet.run import Run, run
@@ -36,8 +36,7 @@ def cluster():
 
 @pytest.fixture
 def plant(tmp_path):
-    path = plants.write_plant(tmp_path, ('A', 'B'), 2)
-    return read_plant(path)
+    return read_plant(plants.write_plant(tmp_path, ('A', 'B'), 2))
 
 
 def echoed(task):
@@ -63,7 +62,7 @@ def test_what_is_new_is_done_and_filed_once(plant, cluster, tmp_path):
 
     there = keys(history)
     nowhere = Cluster('tcp://127.0.0.1:1')  # which is not asked for
-    assert run(plant, history, nowhere, out) == running.Run()
+    assert run(plant, history, nowhere, out) == Run()
 
     third = tmp_path / 'nights/A/002.DAT'  # a table, as for identify
     third.write_text(plants.night(*plants.robot(0), 2))
@@ -89,7 +88,7 @@ def test_a_night_counts_once_whatever_its_file_is_called(plant, cluster, tmp_pat
     assert {one, other} == {str(first), str(copy)}
 
     done = []
-    monkeypatch.setitem(running.work.__globals__, 'table', lambda *_: done.append(0))
+    monkeypatch.setattr('calib_ros.fleet.tasks.table', lambda *_: done.append(0))
     again = run(plant, history, cluster, out)
     assert (again.copies, again.filed, again.errors, done) == (found.copies, 0, {}, [])
     (status,) = (s for s in statuses(plant, history, again, 100.0) if s.robot.serial == 'A')
@@ -324,7 +323,7 @@ def test_a_page_that_cannot_be_written_costs_no_result(plant, cluster, tmp_path)
     assert error.startswith('the page of its report: ')
     assert 'robots/A' in error
     (out / 'robots/A').unlink()
-    assert run(plant, history, cluster, out) == running.Run(seconds=ANY)
+    assert run(plant, history, cluster, out) == Run(seconds=ANY)
     assert len(list(out.glob('robots/*/*.html'))) == 2
 
 
@@ -362,10 +361,8 @@ def test_a_history_that_cannot_be_read_ends_the_run(plant, tmp_path, monkeypatch
 
 def test_the_task_that_ends_a_worker_is_found(plant, cluster):
     tasks = [Task(plant[0], SourceFile(str(number))) for number in range(200)]
-    with clusters.workers_of(cluster) as client:
-        done = {
-            task.source.url: found for task, found in clusters.done_tasks(client, tasks, echoed)
-        }
+    with workers_of(cluster) as client:
+        done = {task.source.url: found for task, found in done_tasks(client, tasks, echoed)}
     assert len(done) == 200
     assert re.fullmatch(r'its worker ended, .*\(--memory\): 150', done.pop('150').error)
     assert all(outcome.error == url for url, outcome in done.items())
@@ -374,8 +371,8 @@ def test_the_task_that_ends_a_worker_is_found(plant, cluster):
 def test_a_scheduler_that_dies_is_told_of(plant):
     tasks = [Task(plant[0], SourceFile(str(number))) for number in range(50)]
     local = LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=':0')
-    with local, clusters.workers_of(Cluster(local.scheduler_address)) as client:
-        found = clusters.done_tasks(client, tasks, echoed)
+    with local, workers_of(Cluster(local.scheduler_address)) as client:
+        found = done_tasks(client, tasks, echoed)
         next(found)
         local.close()
         with pytest.raises(LostError, match='results so far are saved; run again'):
@@ -384,22 +381,20 @@ def test_a_scheduler_that_dies_is_told_of(plant):
 
 def test_faults_of_ours_cost_their_source_only(plant, cluster, tmp_path, monkeypatch):
     history = History(tmp_path / 'history')
-    original = running.work.__globals__['table']
 
     def faulty(path, *rest):
         if path.name == '000.csv':
             raise ZeroDivisionError('by zero')
-        return original(path, *rest)
+        return table(path, *rest)
 
-    monkeypatch.setitem(running.work.__globals__, 'table', faulty)
+    monkeypatch.setattr('calib_ros.fleet.tasks.table', faulty)
     found = run(plant, history, cluster)
     assert found.filed == 2
-    assert [next(iter(each.values())) for each in found.errors.values()] == [
-        'ZeroDivisionError: by zero'
-    ] * 2
+    told = [next(iter(each.values())) for each in found.errors.values()]
+    assert told == ['ZeroDivisionError: by zero'] * 2
 
 
 def test_workers_of_another_version_are_refused(plant, cluster, tmp_path, monkeypatch):
-    monkeypatch.setattr(clusters, '_version', lambda: '0.0.1')
+    monkeypatch.setattr('calib_ros.fleet.cluster._version', lambda: '0.0.1')
     with pytest.raises(ConfigError, match=r'workers have calib_ros 0\.0\.1'):
         run(plant, History(tmp_path / 'history'), cluster)
