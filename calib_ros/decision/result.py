@@ -49,7 +49,7 @@ class Identification(Shown):
     """How these pairs were held out."""
     noise: Noise
     distances: tuple[FloatArray, ...]
-    """Residuals (N,) of each set's samples in units of the usual one (`robust.py`)."""
+    """Residuals (N,) of each set's samples in units of the usual one (`weights.py`)."""
     outliers: tuple[Outlier, ...]
     """Samples with gross errors; they carry little or no weight in the fit."""
     gauges: dict[str, list[str]]
