@@ -9,7 +9,7 @@ and tool are found from the first or last third of the session.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import permutations, product
 
@@ -107,6 +107,48 @@ def other_order(
     what = 'the joint values fit the measurements hardly better than in other orders of the rows'
     remedy = 'was one sorted without the others? If so, export them again, and sort whole rows'
     return Suspect(f'{what}, and one way from row to row goes {names}', remedy), np.nan
+
+
+def in_turn(
+    problem: Problem, nominal: Chain, seen: Observations, most: float
+) -> tuple[Suspect, float] | None:
+    """Return that rows are of targets, devices or arms in turn, as `row_loss`.
+
+    The arm fits each alone within `most` [m]. They are told apart by their places among the rows
+    of one stop, else among all.
+    """
+    rows = np.arange(len(seen))
+    begins = np.flatnonzero(np.diff(seen.stops, prepend=-1))
+    for turns in (rows - begins[seen.stops], *(rows % (2 + k) for k in range(SEVERAL))):
+        parts = [turns == k for k in range(1 + turns.max(initial=0))]
+        parts = [part for part in parts if part.sum() >= 2 * IN_A_FRAME]
+        if len(parts) < 2 or sum(part.sum() for part in parts) < EXPLAINED_ROWS * len(rows):
+            continue
+        alone, errors = list[Chain](), [0.0]
+        while errors[-1] <= most and len(alone) < len(parts):
+            found = in_frames(problem, nominal, (seen.select(parts[len(alone)]),))
+            alone.append(found.chain)
+            errors.append(found.error)
+        if max(errors) <= most:
+            return _named_in_turn(alone, seen, most), max(errors)
+    return None
+
+
+def _named_in_turn(alone: Sequence[Chain], seen: Observations, most: float) -> Suspect:
+    """Return what is measured in turn, by the frame of each alone that is the same for all."""
+    for kind, shared in (('target', seen.base), ('device', seen.tool)):
+        places = np.array([chain.frame(shared).matrix[:3, 3] for chain in alone])
+        if np.ptp(places, axis=0).max() <= most:
+            return Suspect(
+                f'the rows are of {len(alone)} {kind}s in turn',
+                f'name them in a column {kind}',
+                published=f'give each its own {kind} in sources',
+            )
+    return Suspect(
+        f'the rows are of {len(alone)} arms, devices or targets in turn',
+        'name them in a column session, and identify each alone (--session)',
+        published='give each its own device in sources',
+    )
 
 
 def in_any_order(chain: Chain, seen: Observations, of_images: bool) -> Iterator[Suspect]:

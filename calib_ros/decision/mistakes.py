@@ -161,6 +161,7 @@ def diagnose(problem: Problem, far: bool = False) -> Diagnosis | None:
         tried = _best_trials(problem, chain, sets, given)
         found = (
             _named(problem, given, tried)
+            or _in_turn(problem, chain, sets, given)
             or _of_repeats(problem, given.chain, _shift_joints(problem, sets[0], 0))
             or _wrong_rotations(problem, chain, sets, given, tried)
             or _in_some_rows(problem, chain, sets, given)
@@ -301,22 +302,25 @@ def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> D
     order = np.sort(sizes)
     least = order[:-1].max(initial=0.0, where=order[1:] > CLEARLY * order[:-1])
     parts = [sizes <= least]
-    if enough := third >= 2 * IN_A_FRAME:
+    if third >= 2 * IN_A_FRAME:
         parts += [rows < third, rows >= 2 * third, rows % 2 == 0, rows % 2 == 1]
     some = (whole.select(part) for part in parts if part.sum() >= FEW)
-    trials = [given, *(in_frames(problem, chain, (each,)) for each in some)]
-    for one in trials:
+    for one in (given, *(in_frames(problem, chain, (each,)) for each in some)):
         if one.error <= largest_of(problem) and (found := _of_rows(problem, one.chain, whole)):
             return found
-    most = min(largest_of(problem), NEARER * given.error)
-    if not enough or any(one.error > most for one in trials[-2:]):
+    return None
+
+
+def _in_turn(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Diagnosis | None:
+    """Return that targets, devices or arms were measured in turn without names, if so."""
+    if len(sets) > 1 or sets[0].socket or _has_images(problem):
         return None
-    two = Suspect(
-        'odd and even rows are of two arms, or of two devices or targets',
-        'name them in a column session, and identify each alone (--session)',
-        published='give each its own device in sources',
-    )
-    return Diagnosis((two,), given.error, np.nan)
+    whole = _shift_joints(problem, sets[0], 0)
+    most = min(largest_of(problem), NEARER * given.error)
+    if (found := lost_rows.in_turn(problem, chain, whole, most)) is None:
+        return None
+    suspect, error = found
+    return Diagnosis((suspect,), given.error, error)
 
 
 def _wrong_rotations(

@@ -79,7 +79,7 @@ def test_rows_that_are_not_like_the_others_are_named():
     mixed = replace(one, positions=np.where(rows % 2, one.positions, other.positions))
     assert diagnose(Problem(arm, one)) is None
     found = diagnose(Problem(arm, mixed))
-    assert str(found).startswith('odd and even rows are of two arms, or of two devices or targets')
+    assert str(found).startswith('the rows are of 2 arms, devices or targets in turn: name them')
     for part, where in ((rows < 22, '1 to 22'), (rows >= 27, '28 to 50')):
         spoilt = replace(one, joints=np.where(part, np.rad2deg(q), q))
         found = diagnose(Problem(arm, spoilt))
@@ -88,6 +88,25 @@ def test_rows_that_are_not_like_the_others_are_named():
             found.suspects[0].remedy == 'write them as the others (--joint-angle deg reads them)'
         )
         assert found.corrected < 0.01
+
+
+@pytest.mark.parametrize(('kind', 'count'), [('target', 3), ('target', 2), ('device', 4)])
+@pytest.mark.parametrize('at_each', [True, False])
+def test_targets_or_devices_measured_in_turn_without_names_are_named(kind, count, at_each):
+    """All at each stop, which is no joint source that stood still, or one at each."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(3)
+    q, turns = arm.random_joints(60, rng), np.arange(60) % count
+    if at_each:
+        q = np.repeat(q[: 60 // count], count, axis=0)
+    seen = measure(faulty(arm, Cell(), rng), q, rng, 5e-5, oriented=True)
+    away = rng.uniform(-0.1, 0.1, (count, 3))[turns]
+    if kind == 'target':
+        away = np.einsum('nij,nj->ni', seen.rotations, away)
+    unnamed = Observations.from_arrays(q, seen.positions + away)
+    found = diagnose(Problem(arm, unnamed))
+    what = f'the rows are of {count} {kind}s in turn: name them in a column {kind} '
+    assert str(found).startswith(what)
+    assert found.corrected < 5e-3 < found.given
 
 
 def test_a_few_rows_of_a_camera_on_the_flange_with_other_quaternions_are_named():
