@@ -135,21 +135,24 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
 def diagnose(problem: Problem, far: bool = False) -> Diagnosis | None:
     """Return what explains the measurements much better than the given input, if anything.
 
-    With `far` only if the arm as given, in its best frames, is further off than faulty arms.
+    With `far` only if the arm as given, in its best frames, is further off than faulty arms. What
+    is measured tells more than balls in sockets, which come after it.
     """
-    sets = tuple(
-        as_poses(problem, each)
-        for each in problem.sets
-        if each.distances is None and _has_images(problem) == (each.pixels is not None)
-    )
-    if not sets or max(map(len, sets)) < IN_A_FRAME:
+    images = _has_images(problem)
+    seen = [e for e in problem.sets if e.distances is None and (e.pixels is not None) == images]
+    sets = [as_poses(problem, each) for each in seen]
+    kinds = ([each for each in sets if each.socket == socket] for socket in (False, True))
+    tried = (_diagnosed(problem, tuple(kind), far) for kind in kinds if kind)
+    return next(filter(None, tried), None)
+
+
+def _diagnosed(problem: Problem, sets: Sets, far: bool) -> Diagnosis | None:
+    """Return what explains the measurements of some sets, as `diagnose`."""
+    if max(map(len, sets)) < IN_A_FRAME:
         return None  # base and tool alone explain nearly all of them
-    base, tool = (
-        frame if frame is not None and frame.fixed else None
-        for frame in (problem.chain.base, problem.chain.tool)
-    )
+    base, tool = (f if f and f.fixed else None for f in (problem.chain.base, problem.chain.tool))
     chain, where = replace(problem.chain, base=base, tool=tool), ''
-    if not any(each.socket for each in sets):
+    if not sets[0].socket:
         sets, where = misfit_set(problem, chain, sets)
     given = in_frames(problem, chain, sets)
     if far and given.error <= largest_of(problem):

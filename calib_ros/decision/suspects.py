@@ -73,7 +73,7 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
             remedy = each.published if each.in_file else 'correct it in --places'
             yield replace(each, remedy=remedy)
         return
-    if not any(each.socket for each in sets):
+    if not sets[0].socket:
         (seen,) = sets
         back = BACK * seen.seen
         for each in _units(chain):

@@ -7,9 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import UR10E, measured_arm
+from fits import NOISE, UR10E, measured_arm
+from in_sockets import cell
 
 from calib_ros import Problem, identify
+from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.decision import mistakes
 from calib_ros.decision.mistakes import (
     Diagnosis,
@@ -81,6 +83,37 @@ def test_few_poses_and_wires_alone_are_not_searched(count, searched, monkeypatch
     wire = replace(seen, distances=np.ones(count), oriented=np.zeros(count, dtype=bool))
     assert diagnose(Problem(UR10E, wire)) is None
     assert bool(tried) == searched
+
+
+@pytest.mark.parametrize('oriented', [False, True])
+@pytest.mark.parametrize(
+    ('lengths', 'angles', 'what'),
+    [
+        (1e3, 1.0, 'the positions are in mm, not metres'),
+        (1.0, np.degrees(1.0), 'the joint values are in degrees, not radians'),
+    ],
+)
+def test_mistakes_beside_sockets_are_those_of_what_is_measured(lengths, angles, what, oriented):
+    """Units of positions were not named beside sockets, and the search took a minute."""
+    true, problem = cell(0, noise=3e-5, count=20)
+    rng = np.random.default_rng(50)
+    true = replace(true, base=random_frame(rng, 2.0))
+    seen = measure(true, true.random_joints(30, rng), rng, *NOISE, oriented=oriented)
+    seen = replace(seen, base='base_tracker', positions=lengths * seen.positions)
+    sets = [replace(e, joints=angles * e.joints) for e in (*problem.sets, seen)]
+    found = diagnose(replace(problem, observations=sets[0], more=sets[1:]))
+    assert [each.what for each in found.suspects] == [what]
+
+
+def test_mistakes_of_sockets_are_named_beside_right_positions():
+    true, problem = cell(0, noise=3e-5, count=20)
+    rng = np.random.default_rng(51)
+    true = replace(true, base=random_frame(rng, 2.0))
+    seen = measure(true, true.random_joints(30, rng), rng, *NOISE)
+    seen = replace(seen, base='base_tracker')
+    sets = [replace(each, joints=np.degrees(each.joints)) for each in problem.sets]
+    found = diagnose(replace(problem, observations=seen, more=sets))
+    assert found.suspects[0].what == 'the joint values are in degrees, not radians'
 
 
 @pytest.mark.parametrize(
