@@ -49,7 +49,6 @@ from calib_ros.estimation.stops import gathered
 from calib_ros.estimation.system import System
 from calib_ros.estimation.uncertainty import covariance
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index
-from calib_ros.settings import EXCEPTION
 
 
 def unmodelled_errors(
@@ -191,7 +190,7 @@ def _random(
     """Return the standard deviations (2,) of the last two kernels (K + 2, n, c, c).
 
     For the posterior's columns (n, c, P), scaled, and its residuals (n, c), and the noise (K,).
-    What looks like noise, as slides of three linear axes do, is as large as that beyond its sigma.
+    Turns that the test would not tell from noise, else tilts, have its size beyond the sigma.
     """
     listed = kernels.reshape(len(kernels), -1)
     taken = listed @ (basis @ np.swapaxes(basis, 1, 2)).ravel()
@@ -201,11 +200,13 @@ def _random(
     sizes = np.diag(pairs)  # white kernels have nothing in common
     own = sizes[arm] - (pairs[arm, white] ** 2 / sizes[white]).sum(axis=1)
     clear = np.where(own > HALF_THE_DIGITS * sizes[arm], own, np.inf)  # not white but for rounding
-    if not (excess > special.ndtri(0.5 + 0.5 * CERTAIN) * np.sqrt(2.0 * clear)).any():
+    limit = special.ndtri(0.5 + 0.5 * CERTAIN) * np.sqrt(2.0 * clear)
+    if not (excess > limit).any():
         beyond = np.where(variances > SUSPICIOUS**2, 1.0 - 1.0 / variances, 0.0)
-        alike = own <= EXCEPTION * sizes[arm]
-        squares = alike * (pairs[arm, white] @ beyond) / np.maximum(sizes[arm], 1e-300)
-        return np.asarray(np.sqrt(squares))
+        squares = (pairs[arm, white] @ beyond) / np.maximum(sizes[arm], 1e-300)
+        hidden = squares * own <= limit  # the test would not tell them from noise
+        hidden[1] &= not hidden[0]
+        return np.asarray(np.sqrt(squares * hidden))
     flat, spread = (x.reshape(*x.shape[:-3], -1, x.shape[-1]) for x in (basis, kernels @ basis))
     inner = flat.T @ spread
     cross, both = (x @ x.T for x in (x.reshape(len(kernels), -1) for x in (spread, inner)))

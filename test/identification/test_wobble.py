@@ -20,6 +20,7 @@ from calib_ros.estimation.joint_errors import (
     wobble_columns,
 )
 from calib_ros.estimation.nuisances import Nuisances, nuisance_products
+from calib_ros.estimation.observations import Observations
 from calib_ros.identification.calibration import parse_calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -190,6 +191,21 @@ def test_beyond_the_sigma_what_looks_like_noise_is_slides_of_three_linear_axes(s
     seen = measure(true, q + rng.normal(scale=slides, size=q.shape), rng, *NOISE)
     result = identify(Problem(chain, replace(seen, joints=q), **SIGMAS))
     assert result.posterior.unmodelled.turns == pytest.approx(slides, rel=0.2, abs=1e-9)
+
+
+def test_few_positions_that_do_not_tell_turns_of_joints_from_noise_do_not_rule_them_out():
+    """What exceeds the stated sigma is the arm's then, and expected errors contain it."""
+    chain, turns, squares = load_chain('denso_hsr065'), [1.5e-4, 1.5e-4, 5e-5, 1.5e-4], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        true, q, new = faulty(chain, Cell(), rng), *np.split(chain.random_joints(220, rng), [20])
+        moved, elsewhere = (each + rng.normal(scale=turns, size=each.shape) for each in (q, new))
+        seen = Observations.from_arrays(q, measure(true, moved, rng, *NOISE).positions)
+        result = identify(Problem(chain, seen, **SIGMAS))
+        error = (true.forward(elsewhere) - result.chain.forward(new))[:, :3, 3]
+        stated = np.trace(result.pose_covariance(new)[:, :3, :3], axis1=1, axis2=2)
+        squares.append((error**2).sum() / stated.sum())
+    assert np.mean(squares) < 1.1
 
 
 def test_few_poses_of_a_sound_arm_are_not_expected_to_be_twice_as_bad():
