@@ -4,6 +4,7 @@
 
 import importlib
 import signal
+import sys
 
 
 def command_line() -> int:
@@ -17,6 +18,10 @@ def node() -> int:
 
 
 def _run(name: str) -> int:
+    try:
+        import fcntl  # noqa: F401
+    except ImportError:
+        sys.exit('calib_ros runs on Linux and macOS: on Windows use it in WSL')
     usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # a background job: none
     if usual:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Programs that are interrupted while they load."""
+"""Programs that are interrupted while they load, or cannot be loaded."""
 
 import signal
 import subprocess
@@ -32,3 +32,13 @@ def test_an_interruption_ends_it_in_silence(program, module):
         child.send_signal(signal.SIGINT)
         assert child.communicate() == ('', '')
     assert child.returncode == -signal.SIGINT
+
+
+def test_windows_is_told_what_to_use_instead():
+    """A traceback ended in `No module named 'fcntl'`."""
+    code = "import sys; sys.modules['fcntl'] = None; from calib_ros import start; "
+    code += 'sys.exit(start.command_line())'
+    given = [sys.executable, '-c', code, 'robots']
+    ended = subprocess.run(given, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout) == (1, '')
+    assert ended.stderr == 'calib_ros runs on Linux and macOS: on Windows use it in WSL\n'
