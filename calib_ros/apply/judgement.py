@@ -18,6 +18,7 @@ from typing import Literal, TypeAlias
 from calib_ros.apply.confidence import limits_of, moments_of
 from calib_ros.decision import mistakes
 from calib_ros.decision.comparison import Comparison, along_base, compare
+from calib_ros.decision.diagnosis import Diagnosis
 from calib_ros.errors import MOST_ENTRIES
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import Observations
@@ -60,7 +61,7 @@ class Judgement:
     """Configurations that would decide with the same RMS error; None if not even DECIDING."""
     reused: float
     """Share of the measurements that the calibration was fitted to (`Calibration.reused`)."""
-    mistake: mistakes.Diagnosis | None
+    mistake: Diagnosis | None
     """What explains measurements that are further off than any arm."""
 
     @property
@@ -123,7 +124,7 @@ def judge(
 
 def _mistake(
     arm: Calibration, sets: Sequence[Observations], error: float, angle: float, of_messages: bool
-) -> mistakes.Diagnosis | None:
+) -> Diagnosis | None:
     if error <= Settings.largest_error and angle <= Settings.largest_angle:
         return None
     problem = Problem(arm.before, sets[0], more=sets[1:], of_messages=of_messages)

@@ -13,14 +13,15 @@ rotation of the base, that of the last joint one of the tool, so neither can be 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from calib_ros.decision import lost_rows
-from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision import lost_rows, orders
+from calib_ros.decision.diagnosis import Diagnosis
+from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import FIRST, ORIENTATIONS, hidden, suspects
 from calib_ros.decision.trials import (
@@ -54,43 +55,9 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import norms
 from calib_ros.settings import EXCEPTION, LEVER
-from calib_ros.shown import are_lines, rounded, rows_in_words
+from calib_ros.shown import are_lines, rows_in_words
 
 Tries: TypeAlias = Sequence[tuple[Trial, Suspect]]
-
-
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
-    """The mistakes that explain the measurements, and typical errors [m] with and without them.
-
-    The latter is NaN if unknown. `where` names the set if others fit the arm.
-    """
-
-    suspects: tuple[Suspect, ...]
-    given: float
-    corrected: float
-    where: str = ''
-
-    @property
-    def alone(self) -> bool:
-        """Tell whether this refuses a result by itself."""
-        other = ORIENTATIONS.what
-        return all(each.rank and not each.chain and each.what != other for each in self.suspects)
-
-    @property
-    def reason(self) -> Reason:
-        """Return the reason to refuse a result: the mistakes, then the typical errors."""
-        whats = [f'{each.what}: {each.remedy}' for each in self.suspects]
-        if np.isnan(self.corrected):
-            return Reason(Rule.MISTAKE, f'{self.where}{whats[0]}')
-        errors = (
-            f' (the uncorrected arm is then typically {rounded(1e3 * self.corrected)} mm off, not '
-            f'{rounded(1e3 * self.given)} mm)'
-        )
-        return Reason(Rule.MISTAKE, f'{self.where}{" -- or ".join(whats)}', errors)
-
-    def __str__(self) -> str:
-        return str(self.reason)
 
 
 def with_mistake(problem: Problem, result: Identification) -> Identification:
@@ -157,7 +124,7 @@ def _diagnosed(problem: Problem, sets: Sets, far: bool) -> Diagnosis | None:
     given = in_frames(problem, chain, sets)
     if far and given.error <= largest_of(problem):
         return None
-    missing = None if _has_images(problem) else lost_rows.constant_axes(chain, given.sets)
+    missing = None if _has_images(problem) else orders.constant_axes(chain, given.sets)
     found = missing and Diagnosis((missing,), given.error, np.nan)  # no change restores it
     found = found or _of_two_tables(problem, chain, sets, given, lost_rows.row_loss)
     if not found:
@@ -170,7 +137,7 @@ def _diagnosed(problem: Problem, sets: Sets, far: bool) -> Diagnosis | None:
             or _in_some_rows(problem, chain, sets, given)
             or _beam_search(problem, chain, given)
             or _named(problem, given, tried, inexact=True)
-            or _of_two_tables(problem, chain, sets, given, lost_rows.other_order)
+            or _of_two_tables(problem, chain, sets, given, orders.other_order)
         )
     return found and _for_messages(problem, replace(found, where=where + found.where))
 
@@ -231,7 +198,7 @@ def _best_trials(
     """
     rough, of_images = [], _has_images(problem)
     likely = suspects(chain, given.sets, of_images)
-    for each in (*likely, *lost_rows.in_any_order(chain, given.sets[0], of_images)):
+    for each in (*likely, *orders.in_any_order(chain, given.sets[0], of_images)):
         if of_rows and (each.chain is not None or not each.changes):
             continue
         few = given.sets
@@ -320,7 +287,7 @@ def _in_turn(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Diagno
         return None
     whole = _shift_joints(problem, sets[0], 0)
     most = min(largest_of(problem), NEARER * given.error)
-    if (found := lost_rows.in_turn(problem, chain, whole, most)) is None:
+    if (found := orders.in_turn(problem, chain, whole, most)) is None:
         return None
     suspect, error = found
     return Diagnosis((suspect,), given.error, error)

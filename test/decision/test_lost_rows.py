@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import Problem, identify
 from calib_ros.apply.simulation import measure
-from calib_ros.decision import lost_rows
+from calib_ros.decision import lost_rows, orders
 from calib_ros.decision.lost_rows import _sides_differ, _where, row_loss
 from calib_ros.decision.mistakes import diagnose
 from calib_ros.estimation.levels import LEAST_ASIDE
@@ -103,15 +103,15 @@ def test_the_values_of_one_joint_sorted_alone_are_named(k):
     joints = seen.joints.copy()
     joints[:, k] = np.sort(joints[:, k])
     mixed = replace(seen, joints=joints)
-    found, _ = lost_rows.other_order(Problem(UR10E, mixed), UR10E, mixed, 0.01)
+    found, _ = orders.other_order(Problem(UR10E, mixed), UR10E, mixed, 0.01)
     assert f'goes {UR10E.joint_names[k]}' in found.what
 
 
 def test_rows_that_fit_are_in_no_other_order_nor_are_those_of_messages():
     *_, seen = measured_arm(1, 40, oriented=False)
-    assert lost_rows.other_order(Problem(UR10E, seen), UR10E, seen, 5e-3) is None
+    assert orders.other_order(Problem(UR10E, seen), UR10E, seen, 5e-3) is None
     swept = seen.select(np.argsort(seen.joints[:, 2]))
-    assert lost_rows.other_order(Problem(UR10E, swept), UR10E, swept, 1e-6) is None  # a worse arm
+    assert orders.other_order(Problem(UR10E, swept), UR10E, swept, 1e-6) is None  # a worse arm
     mixed = replace(seen, joints=seen.joints[np.random.default_rng(1).permutation(40)])
     assert diagnose(Problem(UR10E, mixed)) is None
     assert (

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision.lost_rows import constant_axes
 from calib_ros.decision.mistakes import diagnose
+from calib_ros.decision.orders import constant_axes
 from calib_ros.decision.rotation_conventions import misread
 from calib_ros.decision.undoing import mirrored, scaled
 from calib_ros.kinematics import se3

@@ -13,8 +13,8 @@ from in_sockets import cell
 from calib_ros import Problem, identify
 from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.decision import mistakes
+from calib_ros.decision.diagnosis import Diagnosis
 from calib_ros.decision.mistakes import (
-    Diagnosis,
     _beam_search,
     _best_trials,
     _named,
@@ -156,7 +156,7 @@ def searched(monkeypatch):
         ]
         hidden = [tuple(one for one in suspects if one.what in pair) for pair in pairs]
         monkeypatch.setattr(mistakes, 'suspects', lambda *_: suspects)
-        monkeypatch.setattr(mistakes.lost_rows, 'in_any_order', lambda *_: ())
+        monkeypatch.setattr(mistakes.orders, 'in_any_order', lambda *_: ())
         monkeypatch.setattr(mistakes, 'hidden', lambda *_: hidden)
         monkeypatch.setattr(mistakes, 'trial_of', trial_of)
         monkeypatch.setattr(mistakes, 'refine_trial', lambda problem, trial: trial)

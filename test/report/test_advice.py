@@ -11,7 +11,7 @@ from pages import page_of, report_of
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply import simulation
-from calib_ros.decision.mistakes import Diagnosis
+from calib_ros.decision.diagnosis import Diagnosis
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.undoing import Suspect
 from calib_ros.report import advice, refusals
