@@ -101,8 +101,10 @@ class Situation:
         if self.left >= FAR:
             return replace(one, steps=(COARSE.format(self.left), *one.steps))
         if self.poses < ENOUGH:
-            more = rules()[Rule.CONFIGURATIONS].steps
-            return replace(one, meaning=FEW_POSES.format(self.poses), steps=more)
+            marked = zip(one.steps, one.unless, strict=True)
+            steps = [step for step, mark in marked if mark == 'auto']
+            steps += rules()[Rule.CONFIGURATIONS].steps
+            return replace(one, meaning=FEW_POSES.format(self.poses), steps=tuple(steps))
         if self.sigma is None:
             return one
         left = LEFT.format(1e3 * self.left * self.sigma, 1e3 * self.sigma)
@@ -127,8 +129,10 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
             short += f': {"; ".join(each.short for each in texts)}'
         needless = (*situation.needless, *['coarse'] * (situation.left >= FAR))
         marked = zip(general.steps, general.unless, strict=True)
-        steps = tuple(step for step, mark in marked if mark not in needless)
-        refusal = replace(general, steps=steps, refusal='; '.join(texts), in_short=short)
+        kept = [each for each in marked if each[1] not in needless]
+        steps, unless = (tuple(each[k] for each in kept) for k in (0, 1))
+        told = replace(general, steps=steps, unless=unless)
+        refusal = replace(told, refusal='; '.join(texts), in_short=short)
         if rule in UNSURE:
             refusal = situation.said_of(refusal)
         first = situation.first_of(rule)

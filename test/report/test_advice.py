@@ -51,9 +51,17 @@ def test_no_gain_is_told_by_how_much_was_measured_and_what_is_left():
     refused = [Reason(Rule.GAIN, 'little gain')]
     (few,) = advice.advice(refused, advice.Situation(poses=14, left=2.5, sigma=1e-4))
     assert few.meaning.startswith('Only 14 different poses')
-    assert few.steps == refusals.rules()[Rule.CONFIGURATIONS].steps
     (enough,) = advice.advice(refused, advice.Situation(poses=50, left=4.62, sigma=1e-4))
     assert 'noise of 0.46 mm in each direction; 0.1 mm is stated' in enough.meaning
+
+
+@pytest.mark.parametrize('rule', [Rule.GAIN, Rule.REGION])
+def test_of_few_poses_the_model_that_bends_is_tried_before_more_are_measured(rule):
+    refused = [Reason(rule, 'little gain')]
+    (geometric,) = advice.advice(refused, advice.Situation(poses=14))
+    (auto,) = advice.advice(refused, advice.Situation(poses=14, needless=('auto',)))
+    assert '--model auto' in geometric.steps[0]
+    assert geometric.steps[1:] == auto.steps == refusals.rules()[Rule.CONFIGURATIONS].steps
 
 
 def test_outliers_are_to_be_looked_at_if_much_is_left():
