@@ -42,29 +42,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))  # noqa: SIM115
     try:
-        options = _options(given)
-        for told in {*OF_REPORTS} & {*vars(options)}:  # never paths: these are of the locale
-            setattr(options, told, _as_utf8(getattr(options, told)))
-        typed = shlex.join(('calib_ros', *map(_as_utf8, given)))
-        options.typed = re.sub('://[^/@]*@', '://', typed)  # no password
-        refuse_alone(options)
-        module, function = options.home.split('.')
-        run = getattr(importlib.import_module(f'calib_ros.cli.{module}'), function)
-        screen = Screen(options.quiet)
-        status: int = run(options, screen)
-        for reason in screen.reasons if options.quiet and status else ():
-            screen.warn(reason, 'calib_ros')
-        sys.stdout.flush()
+        try:
+            options = _options(given)
+            for told in {*OF_REPORTS} & {*vars(options)}:  # never paths: these are of the locale
+                setattr(options, told, _as_utf8(getattr(options, told)))
+            typed = shlex.join(('calib_ros', *map(_as_utf8, given)))
+            options.typed = re.sub('://[^/@]*@', '://', typed)  # no password
+            refuse_alone(options)
+            module, function = options.home.split('.')
+            run = getattr(importlib.import_module(f'calib_ros.cli.{module}'), function)
+            screen = Screen(options.quiet)
+            status: int = run(options, screen)
+            for reason in screen.reasons if options.quiet and status else ():
+                screen.warn(reason, 'calib_ros')
+        finally:  # of a help, too
+            sys.stdout.flush()
     except BrokenPipeError:  # the reader has ended
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 128 + 13
     except KeyboardInterrupt:
         return _failed('interrupted: no half-written file remains', 130)
     except MemoryError:
         return _failed('out of memory: give less data, or close other programs')
     except (CalibrationError, OSError) as err:
+        _drop_output()
         return _failed(trouble(err))
     return status
+
+
+def _drop_output() -> None:
+    """Drop what standard output does not take, or Python tries again at its end and says so."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _as_utf8(text: str) -> str:
