@@ -80,17 +80,20 @@ def _errors(fitted: Fitted, wires: Sequence[str], tried: Sequence[tuple[int, ...
     """Return the sizes (K, 8) of errors of the devices that explain a misfit best, or zeros.
 
     `tried` are numbers of `_terms`. Nor must a usual sag of the arm explain as much, or another
-    place of frames that are held.
+    place of frames that are held. What the distances have to spare beyond places and terms counts:
+    the rest of the measurements tells nothing of their noise.
     """
     rows, count, sags = _rows(fitted, wires)
     equations = len(rows[0])
+    pairs = zip(fitted.problem.sets, fitted.robust.inliers, strict=True)
+    spare = sum(int(good.sum()) for each, good in pairs if each.base in wires) - 3 * len(wires)
     factor = np.asarray(np.linalg.qr(np.concatenate(rows), mode='r'))
     best, lowest = np.zeros((len(wires), TERMS)), np.inf
     most = _left(factor, range(count + sags))[1]
     for terms in tried:
         added = [count + sags + TERMS * k + term for k in range(len(wires)) for term in terms]
         found, left = _left(factor, [*range(count), *added])
-        free = equations - count - len(added)
+        free = min(equations - count, spare) - len(added)
         if free <= 0 or most <= ALIKE**2 * left:
             continue
         chance = chance_of((most - left) * free / max(left, ROUNDING), len(added), free)
