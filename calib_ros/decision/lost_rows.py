@@ -121,7 +121,7 @@ def computed_rows(problem: Problem) -> str:
     alone = seen.changed(base='base', tool='tool')
     least = NEARER * np.ptp(seen.joints, axis=0)
     for parts in (rows < third, rows >= len(seen) - third), (rows % 2 == 0, rows % 2 == 1):
-        some = [each for each in map(alone.select, parts) if _covers(each, least)]
+        some = [each for each in map(alone.select, parts) if covers(each, least)]
         trials = [in_frames(problem, arm, (each,)) for each in some]
         found = sorted(trials, key=lambda one: one.error)
         if len(found) < 2 or found[1].error > largest_of(problem):
@@ -137,9 +137,10 @@ def computed_rows(problem: Problem) -> str:
     return ''
 
 
-def _covers(seen: Observations, least: FloatArray) -> bool:
+def covers(seen: Observations, least: FloatArray, fewest: int = IN_A_FRAME + 1) -> bool:
+    """Tell whether joints vary by at least (n,) [rad] or [m], in so many configurations."""
     wide = bool((np.ptp(seen.joints, axis=0) >= least).all())
-    return wide and count_distinct(seen.configurations) > IN_A_FRAME
+    return wide and count_distinct(seen.configurations) >= fewest
 
 
 def _where(before: Flags, after: Flags) -> int:

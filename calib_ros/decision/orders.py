@@ -10,7 +10,7 @@ from itertools import permutations
 
 import numpy as np
 
-from calib_ros.decision.lost_rows import EXPLAINED_ROWS, FEWEST_ROWS, MOST_SEARCHED
+from calib_ros.decision.lost_rows import EXPLAINED_ROWS, FEWEST_ROWS, MOST_SEARCHED, covers
 from calib_ros.decision.suspects import reordered
 from calib_ros.decision.trials import in_frames
 from calib_ros.decision.undoing import Sets, Suspect
@@ -61,13 +61,14 @@ def in_turn(
     """Return that rows are of targets, devices or arms in turn, as `row_loss`.
 
     The arm fits each alone within `most` [m]. They are told apart by their places among the rows
-    of one stop, else among all.
+    of one stop, else among all. Each visits enough configurations, as far apart as those of all:
+    frames explain few of them, or those of one place, whatever is wrong.
     """
-    rows = np.arange(len(seen))
+    rows, least = np.arange(len(seen)), np.ptp(seen.joints, axis=0) / 2.0
     begins = np.flatnonzero(np.diff(seen.stops, prepend=-1))
     for turns in (rows - begins[seen.stops], *(rows % (2 + k) for k in range(SEVERAL))):
         parts = [turns == k for k in range(1 + turns.max(initial=0))]
-        parts = [part for part in parts if part.sum() >= 2 * IN_A_FRAME]
+        parts = [part for part in parts if covers(seen.select(part), least, 2 * IN_A_FRAME)]
         if len(parts) < 2 or sum(part.sum() for part in parts) < EXPLAINED_ROWS * len(rows):
             continue
         alone, errors = list[Chain](), [0.0]

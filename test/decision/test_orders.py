@@ -109,6 +109,22 @@ def test_targets_or_devices_measured_in_turn_without_names_are_named(kind, count
     assert found.corrected < 5e-3 < found.given
 
 
+@pytest.mark.parametrize('kind', ['a loop of six poses', 'three places in turn'])
+def test_few_configurations_or_places_in_turn_are_not_several_arms(kind):
+    """Frames explain three poses each, or those of one place, beside any error of a joint."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(100)
+    places = arm.random_joints(63, rng)
+    q = np.tile(places[:6], (10, 1))
+    wrong, oriented = 0.0, False
+    if kind == 'three places in turn':
+        q = places[60 + np.arange(60) % 3] + rng.normal(scale=0.1, size=(60, 6))
+        wrong, oriented = 0.1, True
+    true = faulty(arm, Cell(), np.random.default_rng(0))
+    seen = measure(true, q, rng, 5e-5, oriented=oriented)
+    seen = replace(seen, joints=q + wrong * np.eye(6)[1])
+    assert 'in turn' not in str(diagnose(Problem(arm, seen)))
+
+
 def test_a_few_rows_of_a_camera_on_the_flange_with_other_quaternions_are_named():
     """As they were measured, before they are inverted."""
     *_, seen = measured_arm(2, 40)
