@@ -21,7 +21,7 @@ def _run(name: str) -> int:
     try:
         import fcntl  # noqa: F401
     except ImportError:
-        sys.exit('calib_ros runs on Linux and macOS: on Windows use it in WSL')
+        sys.exit('calib_ros does not run on Windows itself: use it in WSL')
     usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # a background job: none
     if usual:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -41,4 +41,4 @@ def test_windows_is_told_what_to_use_instead():
     given = [sys.executable, '-c', code, 'robots']
     ended = subprocess.run(given, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout) == (1, '')
-    assert ended.stderr == 'calib_ros runs on Linux and macOS: on Windows use it in WSL\n'
+    assert ended.stderr == 'calib_ros does not run on Windows itself: use it in WSL\n'
