@@ -125,14 +125,12 @@ def _rows(fitted: Fitted, wires: Sequence[str]) -> tuple[list[FloatArray], int, 
     system, chain = replace(problem, learned=Learned(sane)).system(sets), fitted.chain
     bent = chain.with_effects(sags)
     rows = system.rows_of(bent, [*names, *sags])
-    longer = problem.system(_shortened(sets, dict.fromkeys(wires, (-1.0, 0.0)))).rows_of(chain, ())
-    for k, (each, more) in enumerate(zip(sets, longer, strict=True)):
-        own = np.zeros((len(wires), TERMS, *more.shape[1:]))
-        if each.base in wires:
-            own[wires.index(each.base)] = _terms(chain, each)[:, np.newaxis] * (
-                more - rows[k][-1:]
-            )
-        parts = rows[k][:-1], own.reshape(-1, *more.shape[1:]), rows[k][-1:]
+    for k, samples in enumerate(system.sets):
+        each, own = samples.observations, np.zeros((len(wires), TERMS, *rows[k].shape[1:]))
+        if each.base in wires and each.distances is not None and not each.plane:
+            terms = _terms(chain, each)[:, np.newaxis]
+            own[wires.index(each.base)] = terms / samples.sigmas[0]
+        parts = rows[k][:-1], own.reshape(-1, *own.shape[2:]), rows[k][-1:]
         rows[k] = np.concatenate(parts)
     given, back = system.extra_rows(bent, [*names, *sags])
     usual = np.diag([1.0 / effects.expected(name) for name in sags])
