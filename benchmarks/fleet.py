@@ -39,8 +39,7 @@ import psutil
 
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.files.history import History
-from calib_ros.fleet import cluster
-from calib_ros.fleet.cluster import Cluster
+from calib_ros.fleet.cluster import Cluster, done_tasks, workers_of
 from calib_ros.fleet.page import write_report
 from calib_ros.fleet.plant import read_plant
 from calib_ros.fleet.run import run
@@ -172,17 +171,17 @@ def by_processes(number, tasks):
 
 def by_workers(number, tasks):
     """Return what workers of dask make of tasks, and the time."""
-    with cluster.workers_of(Cluster('', number)) as client:
-        list(cluster.done_tasks(client, tasks[:number], cpu))
+    with workers_of(Cluster('', number)) as client:
+        list(done_tasks(client, tasks[:number], cpu))
         begin = time.monotonic()
-        found = [outcome for _, outcome in cluster.done_tasks(client, tasks, cpu)]
+        found = [outcome for _, outcome in done_tasks(client, tasks, cpu)]
         return found, time.monotonic() - begin
 
 
 def workers_part(folder, tables, poses, rounds):
     """Return how many large tables one and two workers do in a second, and plain processes."""
     plant = read_plant(plants.write_plant(folder, ['R'], tables, poses))
-    tasks = [Task(plant[0], source) for source in sources(plant[0])]
+    tasks = [Task(plant[0], source) for source in sources(plant[0])[0]]
     speed, cost = {}, {}
     for _ in range(rounds):
         for number, way in product((1, 2), (by_processes, by_workers)):
@@ -210,11 +209,11 @@ def nothing(_):
 def scheduler_part(folder, count):
     """Return the time of client and scheduler for each of many tasks of 0.1 s."""
     plant = read_plant(plants.write_plant(folder, ['R'], 1))
-    tasks = [Task(plant[0], sources(plant[0])[0])] * count
-    with cluster.workers_of(Cluster('', 2)) as client:
-        list(cluster.done_tasks(client, tasks[:50], nothing))
+    tasks = [Task(plant[0], sources(plant[0])[0][0])] * count
+    with workers_of(Cluster('', 2)) as client:
+        list(done_tasks(client, tasks[:50], nothing))
         begin, spent = time.monotonic(), time.process_time()
-        list(cluster.done_tasks(client, tasks, nothing))
+        list(done_tasks(client, tasks, nothing))
         span, spent = time.monotonic() - begin, time.process_time() - spent
         return {'cpu_ms': 1e3 * spent / count, 'idle_share': 1.0 - 0.1 * count / 2 / span}
 

@@ -125,10 +125,10 @@ def spoilt(problem):
     def both(each, size, angle=1.0):
         return replace(each, positions=size * each.positions, joints=angle * each.joints)
 
-    for unit, size in suspects.SCALES.items():
+    for unit, name, size in suspects.UNITS:
         yield (
             unit,
-            f'positions are in {unit},',
+            f'positions are in {name},',
             with_(lambda e, size=size: both(e, 1.0 / size), measured),
         )
     yield 'degrees', 'in degrees,', with_(joints(np.degrees))

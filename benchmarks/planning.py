@@ -41,7 +41,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from real_robots import DATA, problem_of
 
-from calib_ros.apply import planning
 from calib_ros.apply.candidates import Visibility, draw_candidates
 from calib_ros.apply.choice import Choice
 from calib_ros.apply.design import Candidates, Design, accuracy, predicted
@@ -52,7 +51,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.kinematics.se3 import transform
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, transform
 
 POSTURE = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2])
 SIGMAS = (1e-4, 1e-4 / 0.3)
@@ -78,7 +77,7 @@ def naive(design, candidates, count):
     space = Candidates(design, candidates)
     rows, size = space.rows, space.rows.shape[2]
     each = [row.T @ row for row in rows]
-    start = space.known + planning.HALF_THE_DIGITS * np.eye(size)
+    start = space.known + HALF_THE_DIGITS * np.eye(size)
 
     def best(others, free):
         information = start + sum(each[k] for k in others)
