@@ -48,7 +48,8 @@ def survey(arm: Calibration, count: int, rng: np.random.Generator) -> Survey:
     """Survey the errors at random configurations within the joint limits."""
     joints = arm.chain.random_joints(count, rng)
     positions, (removed, _) = in_base(arm.chain, joints)[:, :3, 3], arm.removed(joints)
-    return Survey(joints, positions, removed, arm.sigma(joints), arm.remaining(joints))
+    remaining, sigma = arm.remaining(joints)
+    return Survey(joints, positions, removed, sigma, remaining)
 
 
 def in_base(chain: Chain, joints: FloatArray) -> FloatArray:

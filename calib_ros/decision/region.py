@@ -12,7 +12,7 @@ import numpy as np
 
 from calib_ros.decision.matrices import damage_error, packed, parse_rows, rows_of, unpacked_matrix
 from calib_ros.errors import UnknownNameError
-from calib_ros.estimation.joint_errors import NOTHING
+from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter
@@ -44,9 +44,14 @@ class Region(Shown):
 
     def known(self, joints: FloatArray) -> FloatArray:
         """Return the expected error (N,) [m] by the parameters alone, compared with `limit`."""
+        return np.sqrt(self.variances(joints, np.s_[:3])[0])
+
+    def variances(
+        self, joints: FloatArray, part: slice, unmodelled: Unmodelled = NOTHING
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the variances (N,) of a part of poses by the parameters, and by the rest."""
         model = ErrorModel(self.chain, self.names, self.base, self.tool)
-        squares = NOTHING.expected(model, self.square, joints)[:, :3, :3]
-        return np.asarray(np.sqrt(np.trace(squares, axis1=1, axis2=2)))
+        return unmodelled.variances(model, self.square, joints, part)
 
     def covers(self, joints: FloatArray) -> Flags:
         """Tell (N,) whether the calibration may be used at joint values (N, n)."""

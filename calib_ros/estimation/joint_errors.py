@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -68,20 +68,36 @@ class Unmodelled(NamedTuple):
 
         In world axes, with expected squares (P, P) of the model's parameters.
         """
+        found = [
+            own @ square @ np.swapaxes(own, 1, 2) + off @ np.swapaxes(off, 1, 2)
+            for own, off in self._seen(model, joints)
+        ]
+        return np.concatenate(found)
+
+    def variances(
+        self, model: ErrorModel, square: FloatArray, joints: FloatArray, part: slice
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the traces (N,) of a `part` of `expected`: by the parameters, and by the rest."""
+        known, beyond = list[FloatArray](), list[FloatArray]()
+        for own, off in self._seen(model, joints):
+            rows = own[:, part]
+            along = (rows.reshape(-1, len(square)) @ square).reshape(rows.shape)
+            known.append(np.einsum('ncp,ncp->n', along, rows))
+            beyond.append((off[:, part] ** 2).sum(axis=(1, 2)))
+        return np.concatenate(known), np.concatenate(beyond)
+
+    def _seen(
+        self, model: ErrorModel, joints: FloatArray
+    ) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Yield the columns (B, 6, P) of a model and (B, 6, K) of the joints, in blocks."""
         chain, count, some = model.chain, len(model.names), any(self.sizes.values())
         every = tuple(dict.fromkeys((*model.names, *(axis_parameters(chain) if some else ()))))
-        joints = chain.joint_values(joints)
-        model, squares = ErrorModel(chain, every, *model.ends), np.empty((len(joints), 6, 6))
-        for first in range(0, len(joints), BLOCK):
-            block = np.s_[first : first + BLOCK]
-            jacobian = model.jacobian(joints[block])
-            own = jacobian[..., :count]
-            squares[block] = own @ square @ np.swapaxes(own, 1, 2)
-            if some:
-                rows = jacobian.transpose(2, 1, 0)
-                off = self.columns(chain, every, joints[block], rows)
-                squares[block] += off.T @ off.transpose(2, 0, 1)
-        return squares
+        joints, model = chain.joint_values(joints), ErrorModel(chain, every, *model.ends)
+        for first in range(0, max(len(joints), 1), BLOCK):
+            block = joints[first : first + BLOCK]
+            jacobian = model.jacobian(block)
+            off = self.columns(chain, every, block, jacobian.T) if some else jacobian.T[:0]
+            yield jacobian[..., :count], off.T
 
 
 NOTHING = Unmodelled()

@@ -190,29 +190,29 @@ class Calibration(Shown):
         Of orientations [rad] by other `components` of the pose. With a region it is the expected
         error, unmodelled effects included.
         """
-        if (region := self.region) is not None:
-            model = ErrorModel(region.chain, region.names, region.base, region.tool)
-            squares = self.unmodelled.expected(model, region.square, joints)
-        elif self.covariance is not None:
-            model = ErrorModel(self.chain, self.names)
-            squares = NOTHING.expected(model, self.covariance, joints)
-        else:
-            return np.full(len(joints), np.nan)
-        return np.asarray(np.sqrt(np.diagonal(squares, 0, 1, 2)[:, components].sum(axis=1)))
+        return np.sqrt(np.add(*self._variances(joints, components)))
 
-    def remaining(self, joints: FloatArray) -> FloatArray:
-        """Return the expected remaining error (N,) [m] at joint values (N, n); NaN if unknown.
+    def _variances(self, joints: FloatArray, part: slice) -> tuple[FloatArray, FloatArray]:
+        """Return the variances (N,) of a part of poses by the parameters, and by the rest."""
+        if self.region is not None:
+            return self.region.variances(joints, part, self.unmodelled)
+        if self.covariance is None:
+            return (np.full(len(joints), np.nan),) * 2
+        return NOTHING.variances(ErrorModel(self.chain, self.names), self.covariance, joints, part)
 
-        The held-out error contains what no parameter explains, so that counts once.
+    def remaining(self, joints: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the expected remaining error (N,) [m] at joint values (N, n), and `sigma` (N,).
+
+        NaN if unknown. The held-out error contains what no parameter explains: that counts once.
         """
-        sigma = self.sigma(joints)
-        known = sigma if self.region is None else self.region.known(joints)
-        return np.maximum(sigma, np.hypot(known, self.residual or 0.0))
+        known, beyond = self._variances(joints, np.s_[:3])
+        sigma = np.sqrt(known + beyond)
+        return np.maximum(sigma, np.hypot(np.sqrt(known), self.residual or 0.0)), sigma
 
     @as_annotated
     def expected(self, joints: FloatArray, model: Model) -> FloatArray:
         """Return the expected error (N,) [m] of a model at joint values (N, n)."""
-        left = self.remaining(joints)
+        left, _ = self.remaining(joints)
         if model == 'nominal':
             return np.hypot(np.nan_to_num(left, nan=self.residual or 0.0), self.removed(joints)[0])
         if np.isnan(left).any():

@@ -82,9 +82,9 @@ def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nomi
     wavy = replace(found, unmodelled=found.unmodelled._replace(waves=1e-4))
     sigma, known = wavy.sigma(q), found.region.known(q)
     assert (sigma > known).all()
-    np.testing.assert_array_equal(replace(wavy, residual=None).remaining(q), sigma)
+    np.testing.assert_array_equal(replace(wavy, residual=None).remaining(q)[0], sigma)
     wanted = np.maximum(sigma, np.hypot(known, found.residual))  # that has the waves
-    np.testing.assert_allclose(wavy.remaining(q), wanted)
+    np.testing.assert_allclose(wavy.remaining(q), (wanted, sigma))
     poses = Observations.from_arrays(q, np.zeros((200, 3)))
     far = replace(found, unmodelled=found.unmodelled._replace(waves=1.0))
     removed = float(np.sqrt(np.mean(found.removed(q)[0] ** 2)))  # no error may be larger
