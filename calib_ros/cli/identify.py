@@ -17,8 +17,7 @@ from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.errors import InputError
-from calib_ros.estimation.observations import Observations, frames_of_sets
-from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.observations import frames_of_sets
 from calib_ros.files import boards, detections, image_places
 from calib_ros.files.lenses import read_lens
 from calib_ros.files.loading import Loaded, load_bag, load_table
@@ -36,7 +35,7 @@ from calib_ros.report.content import Origin
 from calib_ros.report.gathered import poses_of, poses_to_verify
 from calib_ros.report.markdown import markdown
 from calib_ros.report.refusals import Advice
-from calib_ros.sampling.dataset import with_lenses
+from calib_ros.sampling.dataset import Dataset
 from calib_ros.settings import Settings, refuse_larger
 from calib_ros.shown import of_them, rounded
 from calib_ros.texts import dump_json
@@ -220,32 +219,27 @@ def _detected(
             + (f'give --chain {image_places.POSED}' if posed else 'give the chain of the arm')
         )
     seen, notes = detections.observed(found, board, places, options.eye_in_hand)
-    warnings = (*left_out, *notes)
-    more: Sequence[Observations] = ()
-    held_out: Sequence[Observations] = ()
-    by_line = True
+    rows = Dataset((), by_line=True)
     if options.csv is not None:
         rows = inputs.table_of(options, options.csv, chain, settings, screen)
-        more, held_out, by_line = rows.fitted, rows.held_out, rows.by_line
-        warnings = (*warnings, *rows.warnings)
         names = ('base_board', 'tool_camera') if seen.on_flange else ('base_camera', 'tool_board')
         seen = replace(seen, base=names[0], tool=names[1])
     known = chain.frame(seen.camera).lens if seen.camera in chain.frame_names else None
     fitted, lens = options.lens == 'fitted', known
     if options.intrinsics is not None:
         lens = read_lens(options.intrinsics, found, fitted)
-    if lens is not None:
-        chain = with_lenses(chain, {seen.camera: replace(lens, fixed=not fitted)})
-    chosen = settings.for_problem() | touched
+    lenses = {} if lens is None else {seen.camera: replace(lens, fixed=not fitted)}
+    warnings = (*left_out, *notes, *rows.warnings)
+    rows = replace(rows, fitted=(seen, *rows.fitted), lenses=lenses, warnings=warnings)
     if posed:
-        chosen['fixed'] = (*chosen['fixed'], *(f'{name}.*' for name in chain.joint_names))
-    problem = Problem(chain, seen, held_out, more=more, **chosen)
+        joints = (f'{name}.*' for name in chain.joint_names)
+        settings = replace(settings, fixed=(*settings.fixed, *joints))
+    loaded = load_table(rows, chain, settings, **touched)
     reason = 'joint values are not known, so the arm was not fitted: only what follows'
     refusals = (Reason(Rule.POSED, reason),) if posed else ()
-    count = sum(map(len, problem.sets))
-    samples = {'samples': count, 'images': len(found.names), 'sets': len(problem.sets)}
-    images = dict(zip(found.lines, found.names, strict=True)) if by_line else {}
-    return Loaded(problem, samples, warnings, '', by_line, images, refusals, instead=posed)
+    samples = loaded.samples | {'images': len(found.names)}
+    images = dict(zip(found.lines, found.names, strict=True)) if rows.by_line else {}
+    return replace(loaded, samples=samples, images=images, refusals=refusals, instead=posed)
 
 
 @dataclass(frozen=True, eq=False)

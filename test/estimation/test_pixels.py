@@ -272,11 +272,12 @@ def test_corners_and_a_table_by_the_command_line(run, tmp_path, rng):
     status, out, _ = run(*given)
     alone = json.loads(out)
     assert (status, alone['rank']) == (0, 30)
-    assert alone['samples'] == {'samples': 720, 'images': 30, 'sets': 1}
+    assert alone['samples'] == {'samples': 720, 'held_out': 0, 'sets': 1, 'images': 30}
     assert alone['validation']['after']['rms_px'] < 0.5
     status, out, _ = run(*given, '--csv', 'poses.csv', '--sigma-position', '5e-5')
     both = json.loads(out)
     assert (status, both['rank']) == (0, 42)
+    assert both['samples'] == {'samples': 740, 'held_out': 0, 'sets': 2, 'images': 30}
     assert 'tool_camera.x' in both['parameters']
     for more, said in (
         (('ur5e',), 'needs --board'),
