@@ -74,19 +74,20 @@ class Account:
 
 
 def lost(kind: str, total: int, dropped: Mapping[Cause, int]) -> tuple[float, str]:
-    """Return the share of messages of a kind that was lost, and the main cause."""
+    """Return the share of messages of a kind that was lost, and that in words with its cause."""
     causes = {c.why: n for c, n in dropped.items() if c.kind == kind and isinstance(c.why, Lost)}
+    share = sum(causes.values()) / total if total else 0.0
     most = max(causes, key=causes.__getitem__, default='')
-    return sum(causes.values()) / total if total else 0.0, most
+    what = 'joint states' if kind == JOINTS else kind
+    return share, f'{100.0 * share:.0f} % of the {what} were dropped: {most}'
 
 
 def too_much_lost(account: Account, largest_loss: float) -> list[Reason]:
     """Return why a result must not be accepted: more than `largest_loss` of a kind was lost."""
     found = []
     for kind, count in ((JOINTS, account.joint_states), (POSES, account.poses)):
-        share, cause = lost(kind, count, account.dropped)
+        share, text = lost(kind, count, account.dropped)
         if share > largest_loss:
-            text = f'{100.0 * share:.0f} % of the {kind} were dropped: {cause}'
             remedy = f'; remove the cause, or {allowing(share)}'
             found.append(Reason(Rule.DROPPED, text, remedy))
     return found

@@ -113,8 +113,7 @@ def losses(received: Mapping[str, int], dropped: Mapping[Cause, int]) -> list[Hi
     """Report a large share of lost messages, and the main cause."""
     found = []
     for kind in (JOINTS, POSES):
-        share, cause = lost(kind, received[kind], dropped)
+        share, words = lost(kind, received[kind], dropped)
         if share > EXCEPTION and share * received[kind] >= NO_ACCIDENT:
-            words = f'{100.0 * share:.0f} % of the {kind} were dropped: {cause}'
-            found.append(Hint(f'{100.0 * share:.0f} % of the {kind} are dropped: {cause}', words))
+            found.append(Hint(words, words))
     return found

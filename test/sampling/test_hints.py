@@ -251,7 +251,7 @@ def test_messages_of_other_joints_are_no_loss(names, lost):
     reasons = [str(each) for each in too_much_lost(made.account(), 0.1)]
     assert len(reasons) == lost
     for words in reasons:
-        assert 'joints were dropped: zero stamp (fill header' in words
+        assert '% of the joint states were dropped: zero stamp (fill header' in words
         assert 'or accept the rest with largest_loss (--largest-loss) 0.34' in words
 
 
@@ -280,7 +280,8 @@ def test_other_values_with_the_same_stamp_are_told(of, other, count):
     warnings = told(made)
     assert len(warnings) == count
     for words in warnings:
-        assert re.match(rf'[45]\d % of the {of} were dropped: different values with ', words)
+        kind = 'joint states' if of == 'joints' else of
+        assert re.match(rf'[45]\d % of the {kind} were dropped: different values with ', words)
 
 
 def test_images_that_come_twice_are_no_loss():
