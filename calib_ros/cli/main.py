@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import logging
 import os
 import re
 import shlex
@@ -38,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     if arguments is None:  # a program, not a call: `timeout` and systemd end it as Ctrl-C does
         signal.signal(signal.SIGTERM, signal.default_int_handler)
+        logging.getLogger('matplotlib').setLevel(logging.ERROR)  # its cache is no one's concern
     for name in ('stdout', 'stderr'):  # closed by the caller: no file may get its number
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))  # noqa: SIM115

@@ -23,9 +23,17 @@ def test_output_that_finds_the_disk_full_is_told_once(given):
     assert printed_in('sh', command) == (1, full)
 
 
+def test_a_home_that_cannot_be_written_is_no_warning(tmp_path):
+    """As under cron: matplotlib advised the operator about its cache, twice."""
+    made = 'board markers --columns 2 --rows 2 --square 0.04 --marker 0.03'
+    made += f' --out {tmp_path}/board.pdf --quiet'
+    assert printed_in('sh', f'HOME=/proc/none {sys.executable} -m calib_ros {made}') == (0, '')
+
+
 def printed_in(shell, command):
-    """Return the exit status and errors of a command whose output Python buffers, as usual."""
-    environment = {name: value for name, value in os.environ.items() if name != 'PYTHONUNBUFFERED'}
+    """Return the exit status and errors of a command with the usual buffers and caches."""
+    unusual = ('PYTHONUNBUFFERED', 'MPLCONFIGDIR', 'XDG_CONFIG_HOME', 'XDG_CACHE_HOME')
+    environment = {name: value for name, value in os.environ.items() if name not in unusual}
     given = [shell, '-c', command]
     ended = subprocess.run(given, env=environment, capture_output=True, text=True, check=False)
     return ended.returncode, ended.stderr
