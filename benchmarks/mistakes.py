@@ -35,7 +35,7 @@ from calib_ros.files.tables import read_table
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain, shipped_robots
 
-DATA = Path(os.environ.get('CALIB_ROS_DATA', Path(__file__).parents[2] / 'shared' / 'data'))
+DATA = Path(os.environ.get('CALIB_ROS_DATA') or Path(__file__).parents[2] / 'shared' / 'data')
 SETS = (
     ('ur10_ipa_leica', 'B', 'chain.yaml'),
     ('ur5_jacobi_lasertracker', 'grid', 'chain.yaml'),

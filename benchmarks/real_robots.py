@@ -35,7 +35,7 @@ from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain_file import load_chain
 
-DATA = Path(os.environ.get('CALIB_ROS_DATA', Path(__file__).parents[2] / 'shared' / 'data'))
+DATA = Path(os.environ.get('CALIB_ROS_DATA') or Path(__file__).parents[2] / 'shared' / 'data')
 # Held-out RMS [mm] of an independent plain least squares with the geometric model.
 SETS = {
     ('ur10_ipa_leica', 'A', 'chain.yaml'): 0.437,

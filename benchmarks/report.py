@@ -135,7 +135,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.screenshots is None:
         sizes()
-    elif 'CALIB_ROS_DATA' not in os.environ:
+    elif not os.environ.get('CALIB_ROS_DATA'):
         parser.error('set CALIB_ROS_DATA to the folder of the measured robots')
     else:
         screenshots(options.screenshots.resolve(), Path(os.environ['CALIB_ROS_DATA']))

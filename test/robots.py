@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-DATA = Path(os.environ.get('CALIB_ROS_DATA', Path(__file__).parents[2] / 'shared' / 'data'))
+DATA = Path(os.environ.get('CALIB_ROS_DATA') or Path(__file__).parents[2] / 'shared' / 'data')
 needs_data = pytest.mark.skipif(
-    not DATA.is_dir() and 'CALIB_ROS_DATA' not in os.environ,
+    not (DATA.is_dir() or os.environ.get('CALIB_ROS_DATA')),
     reason=f'no measured robots at {DATA}; set CALIB_ROS_DATA',
 )
