@@ -31,7 +31,7 @@ from calib_ros.values import SAME
 WEAK = Settings.largest_error
 """Standard deviation [m or rad] beyond which a parameter is named as weakly determined: an arm
 with such an error is not accepted."""
-REFUSED = 'NOT accepted, nothing is published'
+REFUSED = 'NOT accepted'
 
 
 def summary(

@@ -218,8 +218,9 @@ class Identifying:
             self.last += f'; {nearer}' * bool(nearer) + KEEP
         else:
             self.earlier = ONE_BEFORE
-            if self._session.calibration is not None:
-                self.last += '; the last good calibration stays in use'
+            used = self._session.calibration is not None
+            kept = 'the last good calibration stays in use' if used else 'nothing is published'
+            self.last += f'; {kept}'
             self._keep_report(page)
         row = partial(result_row, result, warnings=loaded.warnings)
         unfiled = self._filer.file(lambda: loaded.problem, given.settings, row)

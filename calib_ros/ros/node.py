@@ -330,8 +330,8 @@ class CalibrationNode(Batched):
         count = len(self.session.samples)
         old = self._archive.start_new()
         self.session.clear()
-        kept = f'; they remain in {old}' if old and count else ''
-        return True, f'{count} poses cleared{kept}; the calibration stays'
+        told = f'{count} poses cleared' + (f'; they remain in {old}' if old and count else '')
+        return True, told + '; the calibration stays' * (self.session.calibration is not None)
 
     def _on_record(self, request: Any) -> Answer:
         self.session.recording = bool(request.data)

@@ -23,6 +23,7 @@ from calib_ros.files.history import History
 from calib_ros.identification.records import nominal_document
 from calib_ros.kinematics.chain_file import calibration_record, dump_chain, load_chain, parse_chain
 from calib_ros.report.refusals import rules
+from calib_ros.report.words import REFUSED
 from calib_ros.ros.identifying import KEEP, NOT_FILED, ONE_BEFORE
 from calib_ros.ros.inputs import deserialised
 from calib_ros.sampling.batches import feed
@@ -80,8 +81,8 @@ def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path,
     reasons, figures = 'no gain on held-out poses; ' * 20, '60 poses, RMS 1 -> 2 mm; ' * 20
     for rule in Rule:
         step = rules()[rule].steps[0]
-        text = f'NOT accepted: {reasons}. To do first: {step} {figures}'
-        identifying._short = f'NOT accepted: {reasons}', step, ''
+        text = f'{REFUSED}: {reasons}. To do first: {step} {figures}'
+        identifying._short = f'{REFUSED}: {reasons}', step, ''
         _, found = identifying.shortened((False, text))
         assert len(found) <= 200
         assert found.startswith('NOT accepted: no gain')
@@ -123,7 +124,7 @@ def test_a_short_answer_names_the_mistake(cell, recording):
     cell.play(some)
     answer = cell.refused('identify')
     assert answer.message.startswith(
-        'NOT accepted, nothing is published: the joint values are in degrees, not radians: '
+        'NOT accepted: the joint values are in degrees, not radians: '
         'correct the publisher and measure again (after ~/clear) ... full text: '
     )
     assert 'To do first: Check at the robot' in cell.in_full(answer)
@@ -161,7 +162,7 @@ def test_a_refusal_leaves_its_report(unsearched, cell, recording):
     (page,) = cell.node._archive.folder.glob('*.identified.html')
     assert answer.message.endswith(f': {page.name}')
     assert 'what to do' in page.read_text()
-    assert f'; report: {page}' in cell.in_full(answer)
+    assert f'; nothing is published; report: {page}' in cell.in_full(answer)
 
 
 def test_answers_are_in_the_log_as_well(cell, recording):
@@ -193,6 +194,7 @@ def test_record_remove_last_and_clear(cell, recording):
     assert len(cell.node.session.samples) == 4
     cleared = cell.done('clear')
     assert '4 poses cleared; they remain in' in cleared.message
+    assert 'calibration' not in cleared.message  # there is none
     assert cell.node.session.account().samples == 0
     assert cell.node.session.account().joint_states == 0
 
