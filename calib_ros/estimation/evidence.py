@@ -65,13 +65,10 @@ class Inference:
     def judging(self) -> Posterior:
         """Return the posterior averaged over plausible sizes, with the device, to judge an arm."""
         columns = self._without_waves
-        evidence, sums = columns.evidence(), columns.sums
-        size, slope = evidence.most_probable(columns.considered)
-        near = evidence.sigma_points(size, slope)
-        found = columns.posterior(evidence, size)
-        evidence.widen(size)
-        shift, covariance = columns.averaged(evidence, near)
-        precision, count = evidence.precision(size), columns.arm.stop
+        evidence, size, wider, near = columns.plausible
+        found, sums = columns.posterior(evidence, size), columns.sums
+        shift, covariance = columns.averaged(wider, near)
+        precision, count = wider.precision(size), columns.arm.stop
         device = _device(sums.plain[:-1, :-1], sums.cross[:-1], sums.doubtful, precision, count)
         found = replace(found, shift=shift, covariance=covariance, device=device)
         return found if self.fitted.held is None else found.held_at(*self.fitted.held)
@@ -83,18 +80,15 @@ class Inference:
         """
         waves, fitted = posterior.unmodelled.waves, self.fitted
         columns = _Columns(self, waves) if waves else self._without_waves
-        evidence, arm, considered = columns.evidence(), columns.arm, columns.considered
-        size, slope = evidence.most_probable(considered)
-        near = evidence.sigma_points(size, slope)
+        (evidence, size, wider, near), arm = columns.plausible, columns.arm
         rival, scale, checked = None, 0.0, bool(fitted.problem.sigma_scale)
         if columns.scaled and fitted.held is None and (checked or columns.scale < PRINTED):
             elsewhere = columns.evidence(max(OUT_OF_SCALE, columns.scale))
-            odds, mean, covariance = elsewhere.odds_against(evidence, size, considered)
+            odds, mean, covariance = elsewhere.odds_against(evidence, size, columns.considered)
             # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
             odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
             rival, scale = (odds, mean[arm], covariance[arm, arm]), float(mean[-1])
-        evidence.widen(size)
-        found = [(w, *solved(*columns.normal, evidence.precision(each))) for w, each in near]
+        found = [(w, *solved(*columns.normal, wider.precision(each))) for w, each in near]
         mixture = [(w, mean[arm], root[arm] @ root[arm].T) for w, mean, root in found]
         if fitted.held is not None:  # nothing measures the scale
             mixture = [posterior.with_held(each, *fitted.held) for each in mixture]
@@ -146,6 +140,13 @@ class _Columns:
             checked = scale is None and self._checked
             groups, given = [*groups, None if checked else 'scale'], [*given, checked or np.inf]
         return Evidence(*self.normal, np.array(given) ** -2.0, groups, typical)
+
+    @cached_property
+    def plausible(self) -> tuple[Evidence, FloatArray, Evidence, list[tuple[float, FloatArray]]]:
+        """Return the evidence, its most probable log sizes (G,), it `widened`, and sizes near."""
+        evidence = self.evidence()
+        size, slope = evidence.most_probable(self.considered)
+        return evidence, size, evidence.widened(size), evidence.sigma_points(size, slope)
 
     def posterior(self, evidence: Evidence, size: FloatArray) -> Posterior:
         """Return the posterior for log sizes (G,), without the device."""

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -127,8 +128,8 @@ class Evidence:
         """
         found, _ = self.most_probable(considered)
         odds = self._probable(found) - usual._probable(size)
-        self.widen(found)
-        mean, root = solved(self._matrix, self._vector, self.precision(found))
+        precision = self.widened(found).precision(found)
+        mean, root = solved(self._matrix, self._vector, precision)
         return odds, mean, root @ root.T
 
     def _probable(self, size: FloatArray) -> float:
@@ -171,14 +172,16 @@ class Evidence:
         most = -np.log(LEAST_SIZE)
         return np.asarray(np.maximum(np.minimum(size, self._typical + most), self._typical - most))
 
-    def widen(self, size: FloatArray) -> None:
-        """Set the variances to the mean over the tails of the prior, for log sizes (G,)."""
+    def widened(self, size: FloatArray) -> Evidence:
+        """Return it with variances averaged over the tails of the prior, for log sizes (G,)."""
+        found = copy.copy(self)
         for _ in range(ROUNDS):
-            mean, variance = self._means(self._weight(size))
-            last = self._tails
-            self._lengthen(mean**2 + variance, 0.0, size, TAILS - 1.0)
-            if np.abs(np.log(self._tails / last)).max(initial=0.0) < SETTLED:
+            mean, variance = found._means(found._weight(size))
+            last = found._tails
+            found._lengthen(mean**2 + variance, 0.0, size, TAILS - 1.0)
+            if np.abs(np.log(found._tails / last)).max(initial=0.0) < SETTLED:
                 break
+        return found
 
     def _means(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return means and variances (P,) for inverse variances (G, P) by group."""

@@ -190,8 +190,7 @@ def test_what_is_not_measured_is_as_uncertain_as_the_tails_of_the_prior():
     """Student's t with three degrees of freedom has three times the variance of a normal one."""
     usual = Evidence(np.zeros((1, 1)), np.zeros(1), np.zeros(1), ['angle'], {'angle': 1e-3})
     size = np.log([2e-3])
-    usual.widen(size)
-    assert usual.precision(size) ** -0.5 == pytest.approx(3.0**0.5 * 2e-3, rel=0.01)
+    assert usual.widened(size).precision(size) ** -0.5 == pytest.approx(3.0**0.5 * 2e-3, rel=0.01)
 
 
 def test_what_is_held_nominal_is_as_uncertain_as_others_are(rng):
