@@ -162,14 +162,17 @@ def basis(
     `approach` (n, B) holds the signs of the preceding velocities; without it there is no backlash.
     """
     phi = np.zeros((len(names), q.shape[1]))
-    q = couple_held(chain, q)
+    q, turned = couple_held(chain, q), dict[bytes, tuple[FloatArray, ...]]()
     for kind, (rows, joints, others) in _by_kind(tuple(names), chain.joint_names).items():
         if kind == 'ratio':
             phi[rows] = q[joints]
         elif kind == 'coupling':
             phi[rows] = q[others.astype(int)]
         elif kind in WAVES:
-            phi[rows] = cos_sin(others[:, np.newaxis] * q[joints])[kind == 'sin']
+            angles = joints.tobytes() + others.tobytes()  # the same of both, as a rule
+            if angles not in turned:
+                turned[angles] = cos_sin(others[:, np.newaxis] * q[joints])
+            phi[rows] = turned[angles][kind == 'sin']
         elif kind in PLAY and approach is not None:
             phi[rows] = approach[joints]
         elif kind in ('gravity', 'compliance'):
