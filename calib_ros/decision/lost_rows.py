@@ -44,7 +44,7 @@ def row_loss(
     corrected.
     """
     count = len(seen)
-    if not FEWEST_ROWS <= count <= MOST_SEARCHED:
+    if problem.of_messages or not FEWEST_ROWS <= count <= MOST_SEARCHED:
         return None
     best: tuple[Suspect, float] | None = None
     remedy = 'is a row missing or duplicated in one of two tables? Correct it'

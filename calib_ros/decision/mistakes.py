@@ -122,22 +122,23 @@ def _diagnosed(problem: Problem, sets: Sets, far: bool) -> Diagnosis | None:
     if not sets[0].socket:
         sets, where = misfit_set(problem, chain, sets)
     given = in_frames(problem, chain, sets)
-    if far and given.error <= largest_of(problem):
+    largest = largest_of(problem)
+    if far and given.error <= largest:
         return None
     missing = None if _has_images(problem) else orders.constant_axes(chain, given.sets)
     found = missing and Diagnosis((missing,), given.error, np.nan)  # no change restores it
-    found = found or _of_two_tables(problem, chain, sets, given, lost_rows.row_loss)
+    found = found or _of_tables(problem, chain, sets, given, lost_rows.row_loss, largest)
     if not found:
-        tried = _best_trials(problem, chain, sets, given)
+        tried, nearer = _best_trials(problem, chain, sets, given), NEARER * given.error
         found = (
             _named(problem, given, tried)
-            or _in_turn(problem, chain, sets, given)
+            or _of_tables(problem, chain, sets, given, orders.in_turn, min(largest, nearer))
             or _of_repeats(problem, given.chain, _shift_joints(problem, sets[0], 0))
             or _wrong_rotations(problem, chain, sets, given, tried)
             or _in_some_rows(problem, chain, sets, given)
             or _beam_search(problem, chain, given)
             or _named(problem, given, tried, inexact=True)
-            or _of_two_tables(problem, chain, sets, given, orders.other_order)
+            or _of_tables(problem, chain, sets, given, orders.other_order, largest)
         )
     return found and _for_messages(problem, replace(found, where=where + found.where))
 
@@ -235,18 +236,21 @@ def _named(
     return Diagnosis(tuple(unlike.values())[:SEVERAL], given.error, best.error)
 
 
-def _of_two_tables(
+def _of_tables(
     problem: Problem,
     chain: Chain,
     sets: Sets,
     given: Trial,
     search: Callable[[Problem, Chain, Observations, float], tuple[Suspect, float] | None],
+    most: float,
 ) -> Diagnosis | None:
-    """Return what is wrong with the rows of two tables side by side, if that explains all."""
-    if problem.of_messages or len(sets) > 1 or sets[0].socket or sets[0].pixels is not None:
+    """Return what is wrong with the rows of tables of one set, if that explains all.
+
+    The arm as corrected has errors of up to `most` [m].
+    """
+    if len(sets) > 1 or sets[0].socket:
         return None
-    whole = _shift_joints(problem, sets[0], 0)
-    if (found := search(problem, chain, whole, largest_of(problem))) is None:
+    if (found := search(problem, chain, _shift_joints(problem, sets[0], 0), most)) is None:
         return None
     suspect, error = found
     # the typical error tells nothing if most rows are right
@@ -279,18 +283,6 @@ def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> D
         if one.error <= largest_of(problem) and (found := _of_rows(problem, one.chain, whole)):
             return found
     return None
-
-
-def _in_turn(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Diagnosis | None:
-    """Return that targets, devices or arms were measured in turn without names, if so."""
-    if len(sets) > 1 or sets[0].socket or _has_images(problem):
-        return None
-    whole = _shift_joints(problem, sets[0], 0)
-    most = min(largest_of(problem), NEARER * given.error)
-    if (found := orders.in_turn(problem, chain, whole, most)) is None:
-        return None
-    suspect, error = found
-    return Diagnosis((suspect,), given.error, error)
 
 
 def _wrong_rotations(

@@ -31,7 +31,7 @@ def other_order(
     than theirs, a column that goes one way was perhaps sorted alone.
     """
     rows = np.arange(len(seen))
-    if not FEWEST_ROWS <= len(rows) <= MOST_SEARCHED:
+    if problem.of_messages or not FEWEST_ROWS <= len(rows) <= MOST_SEARCHED:
         return None
     what = 'the joint values stand in the reverse order of the measurements'
     orders = [('', rows), (what, rows[::-1])]
@@ -64,6 +64,8 @@ def in_turn(
     of one stop, else among all. Each visits enough configurations, as far apart as those of all:
     frames explain few of them, or those of one place, whatever is wrong.
     """
+    if any(each.pixels is not None for each in problem.sets):
+        return None
     rows, least = np.arange(len(seen)), np.ptp(seen.joints, axis=0) / 2.0
     begins = np.flatnonzero(np.diff(seen.stops, prepend=-1))
     for turns in (rows - begins[seen.stops], *(rows % (2 + k) for k in range(SEVERAL))):
