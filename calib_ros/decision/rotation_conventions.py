@@ -10,7 +10,6 @@ turns about rotated axes; zyx about fixed ones is the same.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator
 from itertools import permutations
 from typing import TypeAlias
@@ -94,9 +93,7 @@ def _beyond(angles: FloatArray, order: str) -> FloatArray:
 
 def _angles(rotations: FloatArray, order: str) -> tuple[FloatArray, FloatArray]:
     """Return both triples of angles (N, 3) about x, y and z [rad] in an order."""
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore')  # any split will do in gimbal lock
-        one = np.asarray(Rotation.from_matrix(rotations).as_euler(order))
+    one = se3.to_euler(rotations, order)
     half = np.copysign(np.pi, one)
     other = np.where([True, False, True], one - half, half - one)
     columns = [order.index(axis) for axis in 'XYZ']

@@ -20,7 +20,6 @@ import csv
 import hashlib
 import io
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, get_args
@@ -241,9 +240,7 @@ def walked(
 
 def xyz_rpy(matrix: FloatArray) -> dict[str, float]:
     """Return a pose (4, 4) as x, y, z [m] and the angles [rad] about fixed axes."""
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore')  # any split will do in gimbal lock
-        angles = Rotation.from_matrix(matrix[:3, :3]).as_euler('xyz')
+    angles = se3.to_euler(matrix[:3, :3], 'xyz')
     again = Rotation.from_euler('xyz', angles).as_matrix()
     if np.abs(again - matrix[:3, :3]).max() > ROUNDING:  # a pitch of 90 degrees but for 1e-7
         angles = to_rpy(matrix[:3, :3], angles)

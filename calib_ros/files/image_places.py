@@ -4,11 +4,9 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import InputError
 from calib_ros.files.columns import check_quaternions, read_columns
@@ -40,10 +38,7 @@ def posed_arm() -> Chain:
 
 def joints_of_poses(positions: FloatArray, rotations: FloatArray) -> FloatArray:
     """Return the joint values (N, 6) of the virtual arm at flange poses."""
-    with warnings.catch_warnings():  # any turn about x will do in gimbal lock
-        warnings.simplefilter('ignore')
-        turns = Rotation.from_matrix(rotations).as_euler('XYZ')
-    return np.column_stack([positions[:, [2, 0, 1]], turns])
+    return np.column_stack([positions[:, [2, 0, 1]], se3.to_euler(rotations, 'XYZ')])
 
 
 def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, tuple[str, ...]]:

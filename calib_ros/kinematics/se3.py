@@ -9,6 +9,7 @@ radians. Transforms are homogeneous 4 x 4 matrices.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -88,6 +89,15 @@ def cos_sin(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
 def log_rotation(rotation: FloatArray) -> FloatArray:
     """Turn (..., 3, 3) rotation matrices into (..., 3) rotation vectors [rad]."""
     return _each(rotation, (3, 3), lambda flat: Rotation.from_matrix(flat).as_rotvec(), (3,))
+
+
+def to_euler(rotation: FloatArray, order: str) -> FloatArray:
+    """Turn (..., 3, 3) rotation matrices into (..., 3) angles [rad] in an order of scipy."""
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')  # any split will do in gimbal lock
+        return _each(
+            rotation, (3, 3), lambda flat: Rotation.from_matrix(flat).as_euler(order), (3,)
+        )
 
 
 def angles_between(first: FloatArray, second: FloatArray) -> FloatArray:
