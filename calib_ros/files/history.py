@@ -36,13 +36,10 @@ class History:
     def __init__(self, place: str | Path) -> None:
         try:
             import pyarrow  # noqa: F401
-            from fsspec.core import url_to_fs
+
+            self._files, self._root = file_system(str(place))
         except ImportError:
             raise ConfigError(NEEDS_PYARROW) from None
-        try:
-            self._files, self._root = url_to_fs(str(place))
-        except (ImportError, ValueError) as err:
-            raise ConfigError(f'a history cannot be at {place}: {err}') from err
         self._local = is_local(self._files)
         if self._local and Path(self._root).exists() and not Path(self._root).is_dir():
             raise ConfigError(f'a history must be a folder: {place} is not one')
@@ -151,6 +148,17 @@ def _unpacked(data: bytes) -> Any:
 
     file = parquet.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
     return file.read(use_threads=False)  # threads of pyarrow abort some processes at their end
+
+
+def file_system(url: str) -> tuple[Any, str]:
+    """Return the fsspec file system of a URL, and the path in it."""
+    from fsspec.core import url_to_fs
+
+    try:
+        files, path = url_to_fs(url)
+    except (ImportError, ValueError) as err:
+        raise ConfigError(f'{url} cannot be opened: {err}') from err
+    return files, path
 
 
 def is_local(files: Any) -> bool:

@@ -11,9 +11,9 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from calib_ros.errors import CalibrationError, ConfigError, InputError
+from calib_ros.errors import CalibrationError, InputError
 from calib_ros.files import hashes
-from calib_ros.files.history import is_local
+from calib_ros.files.history import file_system, is_local
 from calib_ros.files.loading import TABLES
 from calib_ros.files.unpacked import RECORDED
 from calib_ros.fleet.plant import Robot
@@ -51,7 +51,7 @@ def sources(robot: Robot) -> tuple[tuple[SourceFile, ...], dict[str, str]]:
 
 
 def _matching(url: str, session: str) -> list[SourceFile]:
-    files, pattern = _file_system(url)
+    files, pattern = file_system(url)
     hidden = _hidden(pattern)  # copies are, until they are whole, and what is half written
     found = []
     for path, info in sorted(files.glob(pattern, detail=True).items()):
@@ -72,7 +72,7 @@ def fetched(url: str) -> Iterator[Path]:
     """
     from distributed import get_worker
 
-    files, path = _file_system(url)
+    files, path = file_system(url)
     if is_local(files):
         yield Path(path)
         return
@@ -80,16 +80,6 @@ def fetched(url: str) -> Iterator[Path]:
         target = Path(folder) / PurePosixPath(path).name
         files.get(path, str(target), recursive=_is_folder(files, path))
         yield target
-
-
-def _file_system(url: str) -> tuple[Any, str]:
-    from fsspec.core import url_to_fs
-
-    try:
-        files, path = url_to_fs(url)
-    except (ImportError, ValueError) as err:
-        raise ConfigError(f'{url} cannot be read: {err}') from err
-    return files, path
 
 
 def _hidden(path: str) -> int:

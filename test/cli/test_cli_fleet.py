@@ -287,7 +287,7 @@ def test_what_cannot_be_asked_for(folder, capsys):
         (['--workers', '-1'], '--workers must be'),
         (['--scheduler', 'tcp://a:1', '--workers', '2'], '--workers does not apply'),
         (['--scheduler', 'tcp://a:1', '--memory', '1GiB'], '--memory does not apply'),
-        (['--history', 'nowhere://x'], 'a history cannot be at nowhere'),
+        (['--history', 'nowhere://x'], 'nowhere://x cannot be opened'),
         (['--history', 'plant.yaml'], 'a history must be a folder: plant.yaml is not one'),
     ):
         assert main(['fleet', 'plant.yaml', '--history', 'history', *more]) == 1

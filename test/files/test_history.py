@@ -180,7 +180,7 @@ def test_serials_and_places_that_cannot_be():
     for serial in ('', 'a\nb', 'x' * 201):
         with pytest.raises(ConfigError, match='serial number'):
             Filing(serial, BEGIN, '', '')
-    with pytest.raises(ConfigError, match='history cannot be at'):
+    with pytest.raises(ConfigError, match='cannot be opened'):
         History('nowhere://history')
 
 
