@@ -141,6 +141,3 @@ class Description:
             if joint.parent in poses:
                 poses[joint.child] = poses[joint.parent] @ joint.origin
         return poses
-
-
-# ---- back into the text
