@@ -47,7 +47,7 @@ def groups_of(problem: Problem) -> list[Moving]:
     found += [Moving(each.name, 'joint', (each.driven,), everywhere) for each in joints]
     wires: dict[str, list[int]] = {}
     for k, each in enumerate(problem.sets):
-        if each.distances is not None and not each.plane:
+        if each.of_wire:
             wires.setdefault(each.base, []).append(k)
     found += [Moving(w, ZERO, (Parameter(w, ZERO),), tuple(sets)) for w, sets in wires.items()]
     if len(wires) > 1:

@@ -35,6 +35,7 @@ from calib_ros.decision.moved import (
     thing_of,
 )
 from calib_ros.decision.trials import largest_of
+from calib_ros.decision.wires import with_terms
 from calib_ros.estimation.configurations import stops
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import SOME
@@ -384,14 +385,11 @@ def _separable(joints: FloatArray, after: Flags) -> bool:
 
 def _rows_of(system: System, chain: Chain, names: Sequence[str]) -> list[FloatArray]:
     """Return the rows of a system as it does, also by zeros of distances."""
-    zeros = [name for name in names if Parameter(name).kind == ZERO]
+    zeros = [name for name in map(Parameter, names) if name.kind == ZERO]
     others = [name for name in names if name not in zeros]
-    order = [[*others, *zeros].index(name) for name in names]
+    order, wires = [[*others, *zeros].index(name) for name in names], [z.owner for z in zeros]
     rows = system.rows_of(chain, others)
     for k, samples in enumerate(system.sets if zeros else ()):
-        seen, own = samples.observations, np.zeros((len(zeros), *rows[k].shape[1:]))
-        if seen.distances is not None and not seen.plane:
-            weights = np.ones(len(seen)) if samples.weights is None else samples.weights
-            own[zeros.index(Parameter(seen.base, ZERO))] = weights / samples.sigmas[0]
-        rows[k] = np.concatenate([rows[k][:-1], own, rows[k][-1:]])[[*order, -1]]
+        longer = np.ones((1, len(samples.observations)))
+        rows[k] = with_terms(rows[k], samples, wires, longer)[[*order, -1]]
     return rows

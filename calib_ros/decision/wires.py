@@ -19,6 +19,7 @@ from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.levels import ALIKE, SEVERAL, SURE, chance_of
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Learned, Problem
+from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.system import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -37,7 +38,7 @@ def wrong_distances(fitted: Fitted) -> tuple[tuple[Reason, ...], Fitted | None]:
     it. The fit of corrected distances follows, or None if they cannot be corrected.
     """
     problem, sets = fitted.problem, fitted.problem.sets
-    wires = [*dict.fromkeys(e.base for e in sets if e.distances is not None and not e.plane)]
+    wires = [*dict.fromkeys(each.base for each in sets if each.of_wire)]
     found = np.zeros((len(wires), 2))
     for _ in range(SEVERAL if wires else 0):
         if not (more := _errors(fitted, wires, CORRECTABLE)[:, :2]).any():
@@ -126,18 +127,24 @@ def _rows(fitted: Fitted, wires: Sequence[str]) -> tuple[list[FloatArray], int, 
     bent = chain.with_effects(sags)
     rows = system.rows_of(bent, [*names, *sags])
     for k, samples in enumerate(system.sets):
-        each, own = samples.observations, np.zeros((len(wires), TERMS, *rows[k].shape[1:]))
-        if each.base in wires and each.distances is not None and not each.plane:
-            terms = _terms(chain, each)[:, np.newaxis]
-            own[wires.index(each.base)] = terms / samples.sigmas[0]
-        parts = rows[k][:-1], own.reshape(-1, *own.shape[2:]), rows[k][-1:]
-        rows[k] = np.concatenate(parts)
+        rows[k] = with_terms(rows[k], samples, wires, _terms(chain, samples.observations))
     given, back = system.extra_rows(bent, [*names, *sags])
     usual = np.diag([1.0 / effects.expected(name) for name in sags])
     known = np.zeros((len(given) + len(sags), len(names) + len(sags) + TERMS * len(wires) + 1))
     known[: len(given), : given.shape[1]], known[: len(given), -1] = given, back
     known[len(given) :, len(names) : given.shape[1]] = usual
     return [stacked(rows), known], len(names), len(sags)
+
+
+def with_terms(
+    rows: FloatArray, samples: Samples, wires: Sequence[str], terms: FloatArray
+) -> FloatArray:
+    """Return rows (P + 1, c, N) with those of errors (T, N) [m] of K wires before the last."""
+    seen, own = samples.observations, np.zeros((len(wires), len(terms), *rows.shape[1:]))
+    if seen.of_wire:
+        weights = np.ones(len(seen)) if samples.weights is None else samples.weights
+        own[wires.index(seen.base)] = (terms * weights / samples.sigmas[0])[:, np.newaxis]
+    return np.concatenate([rows[:-1], own.reshape(-1, *rows.shape[1:]), rows[-1:]])
 
 
 def _terms(chain: Chain, each: Observations) -> FloatArray:

@@ -278,6 +278,11 @@ class Observations(Shown):
         return self.points is not None and self.pixels is None
 
     @property
+    def of_wire(self) -> bool:
+        """Tell whether they are distances to the origin of the world, as of a draw-wire."""
+        return self.distances is not None and not self.plane
+
+    @property
     def turned(self) -> bool:
         """Tell whether orientations were measured, or show in images."""
         return self.pixels is not None or bool(self.oriented.any())

@@ -135,7 +135,7 @@ def _start_one(
         return next(closed_forms(chain, observations))
     subset = observations.spread()
     system = System((Samples(subset, *sigmas),))
-    if subset.distances is not None and not subset.plane:
+    if subset.of_wire:
         start = _trilaterated(chain, flange(chain, subset), subset)
         lengths = [name for name in names if name.is_length]
         return thorough_fit(start, lengths, system, loss).fit.chain
