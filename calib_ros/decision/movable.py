@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 from calib_ros.decision.moved import ZERO
 from calib_ros.estimation.problem import Problem
@@ -43,6 +43,8 @@ def groups_of(problem: Problem) -> list[Moving]:
             socket = kind == 'base' and (seen.socket or seen.seen)  # the ball turns in it
             names = parameters_of(frame)[: 3 if socket else 6]
             found.append(Moving(frame, kind, names, tuple(sets), problem.model.frame(frame).fixed))
+        if kind == 'base' and len(found) > 1:  # the robot's foot
+            found.append(_together(found))
     joints, everywhere = problem.chain.joints, tuple(range(len(problem.sets)))
     found += [Moving(each.name, 'joint', (each.driven,), everywhere) for each in joints]
     wires: dict[str, list[int]] = {}
@@ -51,6 +53,11 @@ def groups_of(problem: Problem) -> list[Moving]:
             wires.setdefault(each.base, []).append(k)
     found += [Moving(w, ZERO, (Parameter(w, ZERO),), tuple(sets)) for w, sets in wires.items()]
     if len(wires) > 1:
-        names, sets = tuple(Parameter(w, ZERO) for w in wires), sorted(chain(*wires.values()))
-        found.append(Moving(', '.join(wires), ZERO, names, tuple(sets)))
+        found.append(_together(found[-len(wires) :]))
     return found
+
+
+def _together(groups: Sequence[Moving]) -> Moving:
+    names = tuple(name for each in groups for name in each.names)
+    sets = tuple(number for each in groups for number in each.sets)
+    return Moving(', '.join(each.what for each in groups), groups[0].kind, names, sets)

@@ -71,6 +71,10 @@ class Step:
         return f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
 
     @property
+    def _are(self) -> str:
+        return 'are' if ', ' in self.what else 'is'
+
+    @property
     def _correction(self) -> str:
         """Return how to make distances before and after alike."""
         after, parts = self.unused != BEFORE_THAT, []
@@ -88,7 +92,7 @@ class Step:
         what = f'the zero of {self.what}' if self.kind in ZEROS else self.what
         moved = f'moved {self._size} before pose {number}'
         if self.outdated:
-            return f'{what} is outdated: it {moved}{again}'
+            return f'{what} {moved} and {self._are} outdated{again}'
         return f'{what} {moved}' + again * self.harmful
 
     @property
@@ -111,7 +115,7 @@ class Step:
             more += '; measure with one load, or fit only the poses before or only those after'
         if self.unused:
             more += f'; measurements {self.unused} carry no weight'
-            more += f': {self.what} is outdated, measure again' * self.outdated
+            more += f': {self.what} {self._are} outdated, measure again' * self.outdated
         if self.longer and not self.slow:
             more += f'; {self._correction}'
         if self.apart:
@@ -136,8 +140,8 @@ def place_of(problem: Problem, number: int, sample: int) -> str:
     return f'{where} (if rows are in the order of measurement)'
 
 
-def thing_of(kind: str, seen: Observations) -> str:
-    """Return what moves with a frame, in words; `kind` as in `Step`."""
+def thing_of(kind: str, seen: Observations, several: bool = False) -> str:
+    """Return what moves with a frame, or with several alike, in words; `kind` as in `Step`."""
     if kind not in IN_THE_CELL:
         return OF_THE_ARM.get(kind, 'the joint')
     of_images = seen.pixels is not None
@@ -148,5 +152,6 @@ def thing_of(kind: str, seen: Observations) -> str:
     elif seen.distances is not None:
         device += ['its zero']
     on_flange, other = (device, target) if seen.inverse or seen.on_flange else (target, device)
+    other = [f'{other[0]}s'] if several else other
     *first, last = on_flange if kind == 'tool' else [*other, "the robot's foot"]
     return f'{", ".join(first)} or {last}' if first else last

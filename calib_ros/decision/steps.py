@@ -50,7 +50,7 @@ from calib_ros.estimation.weights import weights_of
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import Flags, FloatArray, Index
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 from calib_ros.settings import EXCEPTION
 
 EXPLAINED = 0.5
@@ -237,7 +237,8 @@ class _Scan:
             by_chance = trials * chance_of(gain / variance, degrees, free - degrees)
             criterion = count * np.log(rest / total) + degrees * np.log(count)
             if share > least and by_chance < 1.0 - SURE and criterion < lowest:
-                lowest, size = criterion, root[k] @ along[k]
+                size = root[k] @ along[k]
+                lowest = criterion - HALF_THE_DIGITS * count  # of equals the first
                 found = _Found(group, int(places[k]), size, share, variance)
         return found
 
@@ -266,7 +267,8 @@ class _Scan:
             if np.isfinite(odds) and first + k in self.torn:
                 odds = float(gains[k])
             if odds - trials > highest:
-                highest, found = odds - trials, _Found(group, int(first) + k, size, 1.0, 0.0)
+                highest = odds - trials + HALF_THE_DIGITS * abs(odds)
+                found = _Found(group, int(first) + k, size, 1.0, 0.0)
         return found
 
     @cached_property
@@ -359,7 +361,7 @@ class _Scan:
         return Step(
             what=group.what,
             kind=group.kind,
-            thing=thing_of(group.kind, seen),
+            thing=thing_of(group.kind, seen, several=', ' in group.what),
             set=of_set,
             sample=int(sample),
             stamp_ns=int(stamp),

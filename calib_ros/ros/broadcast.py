@@ -49,7 +49,7 @@ class Broadcast:
     def publish(self, chain: Chain, world: str, in_hand: bool, outdated: str = '') -> None:
         """Publish the frames of a calibrated chain measured in the frame `world`.
 
-        The `outdated` one has moved since, and is left out.
+        Those `outdated`, joined by commas, have moved since, and are left out.
         """
         if self._publisher is None:
             return
@@ -66,7 +66,8 @@ class Broadcast:
                 f'the measurements come in frame "{world}": /tf_static lacks it; give it a name '
                 'other than base_frame, flange_frame and target_frame'
             )
-        found.pop(outdated, None)
+        for frame in outdated.split(', '):
+            found.pop(frame, None)
         transforms = [self._transform(*each) for each in found.values() if all(each[:2])]
         self._publisher.publish(self._type(transforms=transforms))
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fits import NOISE, SIGMAS, UR10E, arm, at_stations, measured_arm
+from in_sockets import cell, led_to
 
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
@@ -201,6 +202,41 @@ def test_zeros_of_draw_wires_that_jump_are_named_one_or_all(jumping):
     for told in (str(step), step.told(AT + 1)):
         assert told.startswith(f'the zero of {step.what} moved by')
     assert not replace(step, unused=moved.FROM_THERE).outdated  # the device stands where it was
+
+
+@pytest.mark.parametrize('seed', [3, 4])
+@pytest.mark.parametrize('moving', [(0, 1), (1,)])
+def test_a_foot_that_moves_is_no_jump_of_several_zeros(seed, moving):
+    """It was told in 27 of 52 sessions with wires at each pose, with a wrong correction."""
+    rng = np.random.default_rng(seed)
+    true, q = arm(rng), UR10E.random_joints(COUNT, rng)
+    places = measure(true, q, rng, NOISE[0], oriented=False).positions
+    sets, shift = [], np.array([1e-3, 1e-3, -1e-3])
+    for k, anchor in enumerate(rng.uniform(-2.0, 2.0, (2, 3))):
+        away = places - anchor
+        away[AT:] += shift * (k in moving)
+        one = Observations.from_arrays(q, np.zeros((COUNT, 3)))
+        sets.append(replace(one, base=f'base_{k}', distances=np.linalg.norm(away, axis=1)))
+    chain = replace(UR10E, base=None)
+    step = find_step(fitting.fit(Problem(chain, sets[0], more=sets[1:], **SIGMAS)))
+    assert (step.kind, step.sample, step.slow) == ('base', AT, False)
+    assert step.what == ', '.join(f'base_{k}' for k in moving)
+    device = 'the measuring devices' if len(moving) > 1 else 'the measuring device, its zero'
+    assert str(step).startswith(f"{device} or the robot's foot moved by")
+    are = 'are' if len(moving) > 1 else 'is'
+    assert f'{step.what} {are} outdated' in str(replace(step, unused=moved.FROM_THERE))
+
+
+def test_of_moves_that_explain_the_same_one_place_is_named():
+    """Sockets visited one after another: the later ones are where the ball is found."""
+    true, problem = cell(1, noise=3e-5, count=12)
+    sets = [e.at((12 * k + np.arange(12)) * 10**9) for k, e in enumerate(problem.sets)]
+    points = np.broadcast_to(true.forward(sets[3].joints)[:, :3, 3].mean(axis=0), (12, 3)).copy()
+    points[7:] += [1e-3, 0.0, 0.0]
+    sets[3] = replace(sets[3], joints=led_to(true, sets[3].joints, points))
+    step = find_step(fitting.fit(problem.with_sets(sets)))
+    assert (step.what, step.sample) == (sets[3].base, 7)
+    assert step.thing == "the socket or the robot's foot"
 
 
 def test_another_load_from_the_first_pose_on_is_no_step_of_an_arm_that_is_held():

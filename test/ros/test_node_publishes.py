@@ -69,7 +69,7 @@ def test_a_delay_is_told_no_finer_than_it_is_known(cell, recording, monkeypatch)
     [
         (8, 'base {}; to keep it call ~/save'),
         (12, 'base {}, measure again after ~/clear ... full text'),
-        (18, 'base is outdated: it {}, measure again after ~/clear; to keep it call ~/save'),
+        (18, 'base {} and is outdated, measure again after ~/clear; to keep it call ~/save'),
     ],
 )
 def test_an_answer_says_that_the_device_was_moved_meanwhile(cell, recording, first, said):
