@@ -12,14 +12,16 @@ import numpy as np
 
 from calib_ros.decision.lost_rows import EXPLAINED_ROWS, FEWEST_ROWS, MOST_SEARCHED, covers
 from calib_ros.decision.suspects import reordered
-from calib_ros.decision.trials import in_frames
+from calib_ros.decision.trials import in_frames, sample_errors
 from calib_ros.decision.undoing import Sets, Suspect
-from calib_ros.estimation.levels import CLEARLY, NEARER, SEVERAL, TELLING, TRIED
+from calib_ros.estimation.levels import CLEARLY, LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.start import flange
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
-from calib_ros.kinematics.se3 import ROUNDING
+from calib_ros.kinematics.se3 import ROUNDING, Index
+from calib_ros.shown import rows_in_words
 
 
 def other_order(
@@ -61,40 +63,74 @@ def in_turn(
     """Return that rows are of targets, devices or arms in turn, as `row_loss`.
 
     The arm fits each alone within `most` [m]. They are told apart by their places among the rows
-    of one stop, else among all. Each visits enough configurations, as far apart as those of all:
-    frames explain few of them, or those of one place, whatever is wrong.
+    of one stop, else among all, or as three or more blocks of rows. Each visits enough
+    configurations, as far apart as those of all: frames explain few of them, or those of one
+    place, whatever is wrong. The chain file holds frames of one of them only.
     """
     if any(each.pixels is not None for each in problem.sets):
         return None
+    arm = replace(nominal, base=None, tool=None, frames=())
     rows, least = np.arange(len(seen)), np.ptp(seen.joints, axis=0) / 2.0
     begins = np.flatnonzero(np.diff(seen.stops, prepend=-1))
-    for turns in (rows - begins[seen.stops], *(rows % (2 + k) for k in range(SEVERAL))):
-        parts = [turns == k for k in range(1 + turns.max(initial=0))]
-        parts = [part for part in parts if covers(seen.select(part), least, 2 * IN_A_FRAME)]
-        if len(parts) < 2 or sum(part.sum() for part in parts) < EXPLAINED_ROWS * len(rows):
+    blocks = _blocks(problem, arm, seen, most)
+    for turns in (rows - begins[seen.stops], *(rows % (2 + k) for k in range(SEVERAL)), blocks):
+        parts = [seen.select(turns == k) for k in range(1 + turns.max(initial=0))]
+        parts = [part for part in parts if covers(part, least, 2 * IN_A_FRAME)]
+        fewest = SEVERAL if turns is blocks else 2  # of two, one moved
+        if len(parts) < fewest or sum(map(len, parts)) < EXPLAINED_ROWS * len(rows):
             continue
-        alone, errors = list[Chain](), [0.0]
-        while errors[-1] <= most and len(alone) < len(parts):
-            found = in_frames(problem, nominal, (seen.select(parts[len(alone)]),))
-            alone.append(found.chain)
-            errors.append(found.error)
+        first = in_frames(problem, arm, (parts[0],))
+        errors = [first.error, *_errors(problem, arm, parts[1:], most)]
         if max(errors) <= most:
-            return _named_in_turn(alone, seen, most), max(errors)
+            how = ' in turn'
+            if turns is blocks:
+                starts = (1 + np.flatnonzero(np.diff(blocks))).tolist()
+                how = f', others from {rows_in_words(starts, seen.stamps_ns)} on'
+            return _named_in_turn(problem, first.chain, parts, most, how), max(errors)
     return None
 
 
-def _named_in_turn(alone: Sequence[Chain], seen: Observations, most: float) -> Suspect:
-    """Return what is measured in turn, by the frame of each alone that is the same for all."""
+def _blocks(problem: Problem, arm: Chain, seen: Observations, most: float) -> Index:
+    """Return numbers (N,) of blocks of rows: one ends where its frames fit no more."""
+    blocks, begin = np.zeros(len(seen), dtype=np.intp), 0
+    while begin + 2 * IN_A_FRAME <= len(seen):
+        found = in_frames(problem, arm, (seen.select(begin + np.arange(2 * IN_A_FRAME)),)).chain
+        later = seen.select(slice(begin, None))
+        far = sample_errors(found, later, flange(found, later)) > most
+        gone = np.flatnonzero(np.lib.stride_tricks.sliding_window_view(far, LEAST_ASIDE).all(1))
+        if not len(gone) or gone[0] < LEAST_ASIDE:
+            break
+        begin += int(gone[0])
+        blocks[begin:] += 1
+    return blocks
+
+
+def _errors(
+    problem: Problem, arm: Chain, parts: Sequence[Observations], most: float
+) -> Iterator[float]:
+    """Yield the error [m] of each part alone, up to the first beyond `most`."""
+    for part in parts:
+        yield (error := in_frames(problem, arm, (part,)).error)
+        if error > most:
+            return
+
+
+def _named_in_turn(
+    problem: Problem, first: Chain, parts: Sequence[Observations], most: float, how: str
+) -> Suspect:
+    """Return what is measured in turn, by the frame of the first that suits all others."""
+    seen = parts[0]
     for kind, shared in (('target', seen.base), ('device', seen.tool)):
-        places = np.array([chain.frame(shared).matrix[:3, 3] for chain in alone])
-        if np.ptp(places, axis=0).max() <= most:
+        known = replace(first, base=None, tool=None, frames=())
+        known = known.with_frame(shared, replace(first.frame(shared), fixed=True))
+        if max(_errors(problem, known, parts[1:], most)) <= most:
             return Suspect(
-                f'the rows are of {len(alone)} {kind}s in turn',
+                f'the rows are of {len(parts)} {kind}s{how}',
                 f'name them in a column {kind}',
                 published=f'give each its own {kind} in sources',
             )
     return Suspect(
-        f'the rows are of {len(alone)} arms, devices or targets in turn',
+        f'the rows are of {len(parts)} arms, devices or targets{how}',
         'name them in a column session, and identify each alone (--session)',
         published='give each its own device in sources',
     )

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import SIGMAS, UR10E, measured_arm
+from fits import SCARA, SIGMAS, UR10E, measured_arm
 
 from calib_ros import identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -107,6 +107,30 @@ def test_targets_or_devices_measured_in_turn_without_names_are_named(kind, count
     what = f'the rows are of {count} {kind}s in turn: name them in a column {kind} '
     assert str(found).startswith(what)
     assert found.corrected < 5e-3 < found.given
+
+
+@pytest.mark.parametrize('kind', ['target', 'device'])
+def test_targets_in_turn_are_told_from_devices_where_base_and_tool_share_a_freedom(kind):
+    """A height over the table is one on the spindle of a SCARA."""
+    rng, true, seen = measured_arm(1, 60, chain=SCARA, oriented=False)
+    away = rng.uniform(-0.1, 0.1, (2, 3))[np.arange(60) % 2]
+    if kind == 'target':
+        away = np.einsum('nij,nj->ni', true.forward(seen.joints)[:, :3, :3], away)
+    found = diagnose(Problem(SCARA, replace(seen, positions=seen.positions + away)))
+    assert str(found).startswith(f'the rows are of 2 {kind}s in turn: name them in a column')
+
+
+@pytest.mark.parametrize(('count', 'each'), [(3, 20), (4, 15)])
+@pytest.mark.parametrize('held', [False, True])
+def test_targets_one_after_the_other_are_named_also_if_the_first_is_held(count, each, held):
+    rng, true, seen = measured_arm(2, count * each)
+    away = np.concatenate([np.zeros((1, 3)), rng.uniform(-0.1, 0.1, (count - 1, 3))])
+    away = np.einsum('nij,nj->ni', seen.rotations, np.repeat(away, each, axis=0))
+    nominal = replace(UR10E, tool=replace(true.frame('tool'), fixed=True)) if held else UR10E
+    found = diagnose(Problem(nominal, replace(seen, positions=seen.positions + away)))
+    lines = ', '.join(str(k * each + 1) for k in range(1, count))
+    what = f'the rows are of {count} targets, others from lines {lines} on: name them in a column'
+    assert str(found).startswith(what)
 
 
 @pytest.mark.parametrize('kind', ['a loop of six poses', 'three places in turn'])
