@@ -18,16 +18,6 @@ PLACES = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 0.125], [0.0, -1.0, 1e-3]])
 TURNED = Rotation.from_rotvec([[0.1, 0.2, 0.3], [-1.0, 0.5, 2.0], [0.2, -0.1, 1.0]])
 
 
-@pytest.fixture
-def read(tmp_path):
-    def read(text, name='cell.csv', joints=2, **layout):
-        path = tmp_path / name
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return read_table(path, joints, foreign=Foreign(Layout(**layout)))
-
-    return read
-
-
 def text_of(*columns, names, separator=','):
     rows = np.column_stack(columns).tolist()
     lines = [separator.join(names), *(separator.join(map(repr, row)) for row in rows)]

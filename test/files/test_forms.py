@@ -57,10 +57,9 @@ FORMS = {
 
 
 @pytest.mark.parametrize('form', FORMS)
-def test_a_table_in_another_form_is_the_same(tmp_path, form):
+def test_a_table_in_another_form_is_the_same(read, tmp_path, form):
     path = tmp_path / 'cell.csv'
-    path.write_text(FORMS[form])
-    assert_same(read_table(path, 2, foreign=Foreign(Layout())), None)
+    assert_same(read(FORMS[form]), None)
     assert_same(loading.table(path, ARM, Settings()), None)
 
 
@@ -138,18 +137,15 @@ def test_a_note_with_as_many_commas_as_a_row_hides_none(tmp_path, note):
     assert found.positions[:, 2].tolist() == [5.0, 6.0, 7.0]
 
 
-def test_a_number_of_a_column_that_is_not_there_is_told(tmp_path):
-    path = tmp_path / 'cell.csv'
-    path.write_text(PLAIN)
+def test_a_number_of_a_column_that_is_not_there_is_told(read):
     with pytest.raises(InputError, match='has no column #9 for session; it has q1, q2, x, y, z'):
-        read_table(path, 2, foreign=Foreign(Layout(columns={'session': '#9'})))
+        read(PLAIN, columns={'session': '#9'})
 
 
-def test_points_between_thousands_are_no_decimals(tmp_path):
+def test_points_between_thousands_are_no_decimals(read, tmp_path):
     """Beside decimal commas; where neither is told from the other, both are refused."""
     path = tmp_path / 'cell.csv'
-    path.write_text('q1;q2;x [mm];y [mm];z [mm];session\n0.642;0,5;999,5;356;1554;B 1,5\n')
-    (found,) = read_table(path, 2, foreign=Foreign(Layout())).fitted
+    (found,) = read('q1;q2;x [mm];y [mm];z [mm];session\n0.642;0,5;999,5;356;1554;B 1,5\n').fitted
     np.testing.assert_allclose(found.joints, [[0.642, 0.5]])
     np.testing.assert_allclose(found.positions, [[0.9995, 0.356, 1.554]])
     text = path.read_text()
@@ -158,18 +154,14 @@ def test_points_between_thousands_are_no_decimals(tmp_path):
         ('\u22121.554', 'write it without the marks between thousands'),
         ('1.554,25', "not '1.554,25': write it without the marks between thousands"),
     ):
-        path.write_text(text.replace('1554', cell))
         with pytest.raises(InputError, match=said):
-            read_table(path, 2, foreign=Foreign(Layout()))
-    path.write_text('q1;q2;x;y;z;note\n0.25;0.5;1.554;1;2;21,5\n')
-    (found,) = read_table(path, 2, foreign=Foreign(Layout())).fitted
+            read(text.replace('1554', cell))
+    (found,) = read('q1;q2;x;y;z;note\n0.25;0.5;1.554;1;2;21,5\n').fitted
     np.testing.assert_allclose(found.positions, [[1.554, 1, 2]])
-    path.write_text('q1;q2;x;y;z\n\u22121,5;2,125;1;2;3\n')
-    (found,) = read_table(path, 2, foreign=Foreign(Layout())).fitted
+    (found,) = read('q1;q2;x;y;z\n\u22121,5;2,125;1;2;3\n').fitted
     np.testing.assert_allclose(found.joints, [[-1.5, 2.125]])
-    path.write_text('q1;q2;x;y;z\n1,554;2,125;1;2;3\n')
     with pytest.raises(InputError, match='give --decimal comma; if these are thousands, write it'):
-        read_table(path, 2, foreign=Foreign(Layout()))
+        read('q1;q2;x;y;z\n1,554;2,125;1;2;3\n')
     (found,) = read_table(path, 2, foreign=Foreign(Layout(decimal=','))).fitted
     np.testing.assert_allclose(found.joints, [[1.554, 2.125]])
 
@@ -317,18 +309,14 @@ def test_rows_without_a_header_have_no_number_too_many(tmp_path, text):
     assert found.positions.tolist() == [[3.0, 4.0, 5.0]] * 2
 
 
-def test_tabs_are_blanks_between_cells(tmp_path):
-    path = tmp_path / 'cell.csv'
-    path.write_text(PLAIN.replace(',', '\t'))
-    assert read_table(path, 2, foreign=Foreign(Layout(separator='space'))).fitted
+def test_tabs_are_blanks_between_cells(read):
+    assert read(PLAIN.replace(',', '\t'), separator='space').fitted
 
 
 @pytest.mark.parametrize(('given', 'found'), [('space', 'comma'), ('comma', 'semicolon')])
-def test_another_separator_than_the_one_given_is_named(tmp_path, given, found):
-    path = tmp_path / 'cell.csv'
-    path.write_text(PLAIN.replace(',', SEPARATORS[found]))
+def test_another_separator_than_the_one_given_is_named(read, given, found):
     with pytest.raises(InputError, match=f'separates its cells by {found}s: give --separator'):
-        read_table(path, 2, foreign=Foreign(Layout(separator=given)))
+        read(PLAIN.replace(',', SEPARATORS[found]), separator=given)
 
 
 def test_decimal_commas_of_a_single_column_are_no_separators(tmp_path):

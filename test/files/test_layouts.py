@@ -213,19 +213,15 @@ def test_each_column_has_its_own_unit(tmp_path, head, row):
 @pytest.mark.parametrize(
     'words', ['Accuracy values in um', 'Sigma values are in mm', 'Unit: in Stuttgart']
 )
-def test_values_of_another_quantity_do_not_give_the_units(tmp_path, words):
+def test_values_of_another_quantity_do_not_give_the_units(read, words):
     """The coordinates were read in these."""
-    path = tmp_path / 'cell.csv'
-    path.write_text(f'{words}\nq1,q2,x,y,z\n0,1,2,3,4\n')
-    (found,) = read_table(path, 2, foreign=Foreign(Layout())).fitted
+    (found,) = read(f'{words}\nq1,q2,x,y,z\n0,1,2,3,4\n').fitted
     assert found.positions.tolist() == [[2.0, 3.0, 4.0]]
 
 
-def test_between_blanks_words_above_the_header_are_no_units_of_columns(tmp_path):
+def test_between_blanks_words_above_the_header_are_no_units_of_columns(read):
     """The second joint was in inches."""
-    path = tmp_path / 'cell.txt'
-    path.write_text('Values in mm\nq1 q2 x y z\n0 1 2 3 4\n')
-    (found,) = read_table(path, 2, foreign=Foreign(Layout())).fitted
+    (found,) = read('Values in mm\nq1 q2 x y z\n0 1 2 3 4\n', 'cell.txt').fitted
     assert found.positions.tolist() == [[2e-3, 3e-3, 4e-3]]
 
 

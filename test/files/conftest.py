@@ -1,0 +1,19 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Tables as others write them."""
+
+import pytest
+
+from calib_ros import read_table
+from calib_ros.files.foreign import Foreign
+from calib_ros.files.layouts import Layout
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(text, name='cell.csv', joints=2, **layout):
+        path = tmp_path / name
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_table(path, joints, foreign=Foreign(Layout(**layout)))
+
+    return read
