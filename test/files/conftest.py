@@ -4,7 +4,8 @@
 
 import pytest
 
-from calib_ros import read_table
+from calib_ros import Settings, read_table
+from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout
 
@@ -17,3 +18,14 @@ def read(tmp_path):
         return read_table(path, joints, foreign=Foreign(Layout(**layout)))
 
     return read
+
+
+@pytest.fixture
+def guessed(tmp_path, request):
+    def guessed(text, name='cell.csv'):
+        """Read the table of the module's ARM as the command line does, without options."""
+        path = tmp_path / name
+        path.write_text(text)
+        return loading.table(path, request.module.ARM, Settings())
+
+    return guessed

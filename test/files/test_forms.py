@@ -71,12 +71,10 @@ def test_a_table_in_another_form_is_the_same(read, tmp_path, form):
         'q1,1,2\nq2,3,4\nx,1,2\ny,2,3\nz,3,4\n',
     ],
 )
-def test_coordinates_below_each_other_are_refused(tmp_path, text):
+def test_coordinates_below_each_other_are_refused(guessed, text):
     """With a word on that; options for columns of these names were proposed."""
-    path = tmp_path / 'cell.csv'
-    path.write_text(text)
     with pytest.raises(InputError, match='has x, y, z below each other, expected a row for each'):
-        loading.table(path, ARM, Settings())
+        guessed(text)
 
 
 def test_rows_that_name_the_joints_are_no_header_of_numbered_columns(tmp_path):
@@ -192,10 +190,8 @@ def test_stamps_in_seconds_are_told_what_to_give(tmp_path):
         read_table(path, 2)
 
 
-def test_a_time_with_decimal_commas_is_no_date(tmp_path):
-    path = tmp_path / 'cell.csv'
-    path.write_text('Time;q1;q2;x;y;z\n0,25;1;2;3;4;5\n0,5;1;2;3;4;5\n')
-    (found,) = loading.table(path, ARM, Settings()).fitted
+def test_a_time_with_decimal_commas_is_no_date(guessed):
+    (found,) = guessed('Time;q1;q2;x;y;z\n0,25;1;2;3;4;5\n0,5;1;2;3;4;5\n').fitted
     assert found.stamps_ns.tolist() == [250_000_000, 500_000_000]
 
 
@@ -208,12 +204,11 @@ def test_empty_stamps_are_lines_and_rows_without_any_measurement_are_told(tmp_pa
         read_table(path, 2)
 
 
-def test_rotation_matrices(tmp_path):
+def test_rotation_matrices(guessed, tmp_path):
     """In nine columns, or in a flattened homogeneous matrix."""
     path = tmp_path / 'cell.csv'
     turned = TURNED.as_matrix().reshape(-1, 9)
-    path.write_text(text_of(JOINTS, PLACES, turned, names=[*'abxyz', *MATRIX]))
-    assert_same(loading.table(path, ARM, Settings()))
+    assert_same(guessed(text_of(JOINTS, PLACES, turned, names=[*'abxyz', *MATRIX])))
     sizes = Layout(columns={f's{each}': '1e-3' for each in ('x', 'y', 'z', 'rx', 'ry', 'rz')})
     (found,) = loading.table(path, ARM, Settings(), foreign=Foreign(sizes, ARM)).fitted
     np.testing.assert_allclose(found.covariance, np.tile(1e-6 * np.eye(6), (3, 1, 1)))
@@ -280,21 +275,17 @@ def test_rows_with_a_number_more_than_the_header_are_refused(tmp_path, rows, lin
         read_table(path, 2, foreign=Foreign(Layout()))
 
 
-def test_an_offset_above_the_header_is_no_table_on_its_side(tmp_path):
+def test_an_offset_above_the_header_is_no_table_on_its_side(guessed):
     """Whose rows and columns were to be exchanged."""
-    path = tmp_path / 'cell.csv'
-    path.write_text('Tool,,\nx,1\ny,2\nz,3\nAxis 1,Axis 2,X_meas,Y_meas,Z_meas\n1,2,3,4,5\n')
     with pytest.raises(InputError, match='x=X_meas,y=Y_meas,z=Z_meas'):
-        loading.table(path, ARM, Settings())
+        guessed('Tool,,\nx,1\ny,2\nz,3\nAxis 1,Axis 2,X_meas,Y_meas,Z_meas\n1,2,3,4,5\n')
 
 
-def test_a_header_that_may_lack_the_name_of_a_column_is_refused(tmp_path):
+def test_a_header_that_may_lack_the_name_of_a_column_is_refused(guessed):
     """The numbers of the poses were q1, and so on, behind a header like those of numpy."""
-    path = tmp_path / 'cell.txt'
     for text in ('# q1 q2 x y z\n1 2 3 4 5 ok\n2 2 3 4 6 ok\n', 'q1,q2,x,y,z\n0,2,1,2,3,ok\n'):
-        path.write_text(text)
         with pytest.raises(InputError, match='line 2: more cells than the 5 columns of its head'):
-            loading.table(path, ARM, Settings())
+            guessed(text, 'cell.txt')
 
 
 @pytest.mark.parametrize(

@@ -111,11 +111,9 @@ def test_nominal_coordinates_are_never_taken_for_measured_ones(tmp_path, first, 
 
 
 @pytest.mark.parametrize('form', ['{}_nom', '{} (nominal)', 'Commanded {}', 'd{}'])
-def test_nominal_coordinates_alone_are_not_proposed(tmp_path, form):
-    path = tmp_path / 'cell.csv'
-    path.write_text(text_of(JOINTS, NOMINAL, names=['q1', 'q2', *names(form)]))
+def test_nominal_coordinates_alone_are_not_proposed(guessed, form):
     with pytest.raises(InputError, match='--columns "x=NAME,y=NAME,z=NAME"'):
-        loading.table(path, ARM, Settings())
+        guessed(text_of(JOINTS, NOMINAL, names=['q1', 'q2', *names(form)]))
 
 
 def test_deviations_tell_that_plain_coordinates_may_be_nominal(tmp_path):
@@ -136,7 +134,7 @@ def test_deviations_tell_that_plain_coordinates_may_be_nominal(tmp_path):
 
 @pytest.mark.parametrize('form', ['{}_corr', '{}_t', '{}_flange', '{} (2)', 'Corrected {}'])
 @pytest.mark.parametrize('ours', [NAMES[2:], ['X', 'Y', 'Z']])
-def test_plain_coordinates_may_be_nominal_beside_any_others(tmp_path, form, ours):
+def test_plain_coordinates_may_be_nominal_beside_any_others(guessed, tmp_path, form, ours):
     """They were read, with a note that the others were not."""
     path = tmp_path / 'cell.csv'
     given = [*NAMES[:2], *ours, *names(form)]
@@ -149,8 +147,7 @@ def test_plain_coordinates_may_be_nominal_beside_any_others(tmp_path, form, ours
         'e{}',
     ):  # others tell what the plain ones are, or are no places
         given = [*NAMES[:2], *ours, *names(other)]
-        path.write_text(text_of(JOINTS, PLACES, NOMINAL, names=given))
-        assert_same(loading.table(path, ARM, Settings()), None)
+        assert_same(guessed(text_of(JOINTS, PLACES, NOMINAL, names=given)), None)
 
 
 @pytest.mark.parametrize(
@@ -202,31 +199,24 @@ def test_names_in_capitals_beside_small_ones_are_in_doubt(tmp_path, names):
     assert_same(proposed(path), None)
 
 
-def test_joints_by_their_names_are_not_mixed_with_ours(tmp_path):
+def test_joints_by_their_names_are_not_mixed_with_ours(guessed):
     """q1 to q4 of a quaternion, as ABB names them, were the first four joints."""
-    path = tmp_path / 'cell.csv'
-    path.write_text(text_of(JOINTS, PLACES, PLACES[:, :1], names=[*ARM.joint_names, *'xyz', 'q1']))
-    table = loading.table(path, ARM, Settings())
+    table = guessed(text_of(JOINTS, PLACES, PLACES[:, :1], names=[*ARM.joint_names, *'xyz', 'q1']))
     assert_same(table, None)
     assert 'columns not read: q1 (' in str(table.warnings)
 
 
-def test_joints_of_a_second_arm_are_not_taken_for_measured_ones(tmp_path):
+def test_joints_of_a_second_arm_are_not_taken_for_measured_ones(guessed):
     """They were asked for in place of q1 and q2."""
-    path = tmp_path / 'cell.csv'
-    path.write_text(text_of(JOINTS, PLACES, JOINTS, names=[*NAMES, 'q2_1', 'q2_2']))
-    assert_same(loading.table(path, ARM, Settings()), None)
+    assert_same(guessed(text_of(JOINTS, PLACES, JOINTS, names=[*NAMES, 'q2_1', 'q2_2'])), None)
 
 
 @pytest.mark.parametrize('form', ['joint{}_speed', 'J{}_torque', 'A{}_power', 'q{}_act_current'])
-def test_other_values_are_never_proposed_for_joints(tmp_path, form):
-    path = tmp_path / 'cell.csv'
+def test_other_values_are_never_proposed_for_joints(guessed, form):
     given = [form.format(1), form.format(2), *NAMES[2:]]
-    path.write_text(text_of(JOINTS, JOINTS + 0.1, PLACES, names=[*NAMES[:2], *given]))
-    assert_same(loading.table(path, ARM, Settings()), None)
-    path.write_text(text_of(JOINTS, PLACES, names=given))
+    assert_same(guessed(text_of(JOINTS, JOINTS + 0.1, PLACES, names=[*NAMES[:2], *given])), None)
     with pytest.raises(InputError, match=r'--columns "q\*=NAME\*"; .*: --joints FILE'):
-        loading.table(path, ARM, Settings())
+        guessed(text_of(JOINTS, PLACES, names=given))
 
 
 @pytest.mark.parametrize('form', ['quat_{}', 'Quat {}', 'q_{}', 'orientation.{}', 'rot_{}'])
@@ -367,14 +357,13 @@ def test_a_location_may_be_anything(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['Length [m]', 'Distance to anchor', 'wire (m)'])
-def test_a_distance_is_proposed(tmp_path, name):
+def test_a_distance_is_proposed(guessed, tmp_path, name):
     path = tmp_path / 'cell.csv'
     path.write_text(text_of(JOINTS, PLACES[:, 0], names=['J1', 'J2', name]))
     (found,) = proposed(path).fitted
     np.testing.assert_allclose(found.distances, PLACES[:, 0])
-    path.write_text(text_of(JOINTS, PLACES[:, 0], names=['J1', 'J2', f'nominal {name}']))
     with pytest.raises(InputError, match='x=NAME,y=NAME,z=NAME'):
-        loading.table(path, ARM, Settings())
+        guessed(text_of(JOINTS, PLACES[:, 0], names=['J1', 'J2', f'nominal {name}']))
 
 
 def test_numbered_columns_of_a_preset_are_of_its_own_form(tmp_path):

@@ -213,7 +213,7 @@ def test_remarks_and_headers_again_are_no_rows(tmp_path, row, place):
         assert any(f'line {place + 3}' in note for note in table.warnings)
 
 
-def test_remarks_below_names_of_poses_are_no_rows(tmp_path):
+def test_remarks_below_names_of_poses_are_no_rows(guessed, tmp_path):
     """Between commas they were refused: q1 was empty. Values that were cut off still are."""
     path = tmp_path / 'cell.csv'
     for row in ('moved the target', '# end', 'nominal load'):
@@ -221,12 +221,10 @@ def test_remarks_below_names_of_poses_are_no_rows(tmp_path):
         for table in tables(path):
             assert_same(table, None)
             assert any('line 5' in note for note in table.warnings)
-    path.write_text(f'{NAMED}Nominal\np,0.1,0.2,1,2,3\n')
     with pytest.raises(InputError, match='the rows below "Nominal" may be nominal'):
-        loading.table(path, ARM, Settings())
-    path.write_text(f'{NAMED}p,0.1\n')
+        guessed(f'{NAMED}Nominal\np,0.1,0.2,1,2,3\n')
     with pytest.raises(InputError, match='line 5: q2 must be'):
-        loading.table(path, ARM, Settings())
+        guessed(f'{NAMED}p,0.1\n')
 
 
 @pytest.mark.parametrize('again', ['q1,q2,x,y,z\n', ''])
@@ -259,12 +257,10 @@ def test_rows_below_a_title_that_calls_them_nominal_are_refused(tmp_path, titles
         assert len(loading.table(path, ARM, Settings()).fitted[0]) == 6
 
 
-def test_a_row_of_words_in_place_of_numbers_is_refused(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_a_row_of_words_in_place_of_numbers_is_refused(guessed):
     for row in ('a,b,c,d,e', '0.1,b,1,2,3', 'q2,q1,x,y,z'):
-        path.write_text(f'{PLAIN}{row}\n')
         with pytest.raises(InputError, match=r'line 5: .* must be a finite number'):
-            loading.table(path, ARM, Settings())
+            guessed(f'{PLAIN}{row}\n')
 
 
 @pytest.mark.parametrize(
@@ -296,14 +292,12 @@ def test_between_blanks_no_cell_is_empty(tmp_path, old, new, said):
 
 @pytest.mark.parametrize('row', ['RMS 0.05', 'Mean 0.1 0.2 0.3', 'Std Dev 0.1'])
 @pytest.mark.parametrize('cell', ['(ok)', '[left]', 'P1'])
-def test_between_blanks_statistics_are_short_and_remarks_in_brackets(tmp_path, row, cell):
+def test_between_blanks_statistics_are_short_and_remarks_in_brackets(guessed, row, cell):
     """The first were refused as short rows, the second read as units of the names of poses."""
-    path = tmp_path / 'cell.txt'
     text = text_of(JOINTS, PLACES, names=NAMES, separator=' ')
     names, *rows = text.splitlines()
     rows = [f'P{k} {cell} {numbers}' for k, numbers in enumerate(rows)]
-    path.write_text('\n'.join([f'name state {names}', *rows, row, '']))
-    assert_same(loading.table(path, ARM, Settings()), None)
+    assert_same(guessed('\n'.join([f'name state {names}', *rows, row, '']), 'cell.txt'), None)
 
 
 def test_between_blanks_a_line_of_units_has_a_cell_for_each_name(tmp_path):
