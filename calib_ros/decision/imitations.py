@@ -15,13 +15,24 @@ from scipy import special
 
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import about_nominal, inverse_root
-from calib_ros.estimation.levels import NEARER, SURE
+from calib_ros.estimation.identifiability import DEGENERATE
+from calib_ros.estimation.levels import CLEARLY, NEARER, SURE
 from calib_ros.estimation.posterior import size_group
 from calib_ros.estimation.sizes import TYPICAL, Evidence
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
 LEAST = float(special.logit(SURE))
 """Log odds, for as many possible moves as there are, from which one is named."""
+
+
+def clear_size(root: FloatArray, along: FloatArray, lengths: FloatArray) -> FloatArray:
+    """Return the size (K,) of a move by (K, D) and (D,), without directions that hardly show.
+
+    `root` is that of `inverse_root` by squared `lengths` (K,). Where only errors of the arm tell a
+    move from one of another frame, as of a height on a SCARA, its size there means nothing.
+    """
+    hidden = np.linalg.norm(np.sqrt(lengths)[:, np.newaxis] * root, axis=0)
+    return np.asarray(root @ np.where(hidden * CLEARLY * DEGENERATE < 1.0, along, 0.0))
 
 
 class Imitation:

@@ -22,7 +22,7 @@ from itertools import pairwise
 import numpy as np
 
 from calib_ros.decision.drift import slow_cosines
-from calib_ros.decision.imitations import LEAST, Imitation
+from calib_ros.decision.imitations import LEAST, Imitation, clear_size
 from calib_ros.decision.movable import Moving, groups_of, of_the_arm
 from calib_ros.decision.moved import (
     BEFORE_THAT,
@@ -237,8 +237,8 @@ class _Scan:
             by_chance = trials * chance_of(gain / variance, degrees, free - degrees)
             criterion = count * np.log(rest / total) + degrees * np.log(count)
             if share > least and by_chance < 1.0 - SURE and criterion < lowest:
-                size = root[k] @ along[k]
                 lowest = criterion - HALF_THE_DIGITS * count  # of equals the first
+                size = clear_size(root[k], along[k], lengths[k, columns])
                 found = _Found(group, int(places[k]), size, share, variance)
         return found
 
