@@ -96,7 +96,7 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
         found.problem = found.problem or problem
         return _salvaged(path, found, session, defined)
     _check_links(streams)
-    warnings = session.last_warnings
+    warnings = tuple(hint.text for hint in session.last_hints)
     if problem is not None:
         lost = f'{max(0, expected - count)} of {expected} messages are lost'
         warnings = (*warnings, f'{path} is damaged ({shortened(problem)}): {lost}')
@@ -127,7 +127,7 @@ def _salvaged(
     total = stored.recorded(found.files[0].parent)
     if total is None and found.whole:
         total = found.count
-    warnings = session.last_warnings
+    warnings = tuple(hint.text for hint in session.last_hints)
     if problem or total != found.count:
         lost = 'how many are lost is not known'
         if total is not None and not (total == found.count and problem == stored.NOT_CLOSED):

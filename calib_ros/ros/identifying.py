@@ -145,9 +145,13 @@ class Identifying:
         try:
             problem = session.problem()
         except InputError as err:
-            why = [] if session.samples else inputs.failures
+            if session.samples:
+                self._failed(err, '')
+                raise
+            why = inputs.failures
             told = InputError('; '.join((*why, str(err))))
-            self._failed(told, '; '.join(why))
+            hint = next((each.status for each in session.last_hints), session.state)
+            self._failed(told, '; '.join(('no poses to fit', *why)), '' if why else hint)
             raise told from err
         samples = tuple(session.usable)
         origin = {

@@ -101,12 +101,12 @@ def unmeasured(stops: int, between: int) -> list[Hint]:
     return [Hint(f'{words}?', f'{words}, and are its frames still named as before?')]
 
 
-def unstopped(stops: int, moving: int) -> tuple[str, ...]:
+def unstopped(stops: int, moving: int) -> list[Hint]:
     """Tell that a motion had hardly any stop, but `moving` measurements."""
     if stops >= FEW or moving < NO_ACCIDENT:
-        return ()
+        return []
     words = f'{moving} measurements came in motion, hardly any at a stop: stop at each pose'
-    return (f'{words}, or set mode to continuous (--mode continuous)',)
+    return [Hint(words, f'{words}, or set mode to continuous (--mode continuous)')]
 
 
 def losses(received: Mapping[str, int], dropped: Mapping[Cause, int]) -> list[Hint]:

@@ -76,10 +76,10 @@ class Pipeline:
         between = 0 if sampler.rested else self.collector.unused[Cause(POSES, MOVING)]
         return found + (unmeasured(missed, between) if sampler.rested or between else [])
 
-    def unstopped(self) -> tuple[str, ...]:
+    def unstopped(self) -> list[Hint]:
         """Tell of a motion with hardly any stop, of which mode continuous takes all."""
         if self.collector.settings.mode != 'dwell':
-            return ()
+            return []
         moving = self.collector.unused[Cause(POSES, MOVING)]
         return unstopped(self.collector.sampler.rested, moving)
 

@@ -243,9 +243,9 @@ class CalibrationSession:
         return tuple(hint.text for hint in self.hints)
 
     @property
-    def last_warnings(self) -> tuple[str, ...]:
-        """Return warnings about a motion that has ended; before it may still stop."""
-        return self.warnings or self._pipeline.unstopped()
+    def last_hints(self) -> list[Hint]:
+        """Return what looks wrong in a motion that has ended; before it may still stop."""
+        return self.hints or self._pipeline.unstopped()
 
     @property
     def hints(self) -> list[Hint]:
@@ -280,7 +280,7 @@ class CalibrationSession:
     @property
     def summary(self) -> str:
         """Return the account of the messages and the warnings as text."""
-        return '; '.join((str(self.account()), *self.last_warnings))
+        return '; '.join((str(self.account()), *(hint.text for hint in self.last_hints)))
 
     @property
     def estimate(self) -> Estimate | None:

@@ -47,6 +47,25 @@ def test_errors_are_answers(cell, recording):
     assert 'too few different poses: 2 measured, at least 5' in cell.refused('identify').message
 
 
+@pytest.mark.parametrize(
+    ('prefix', 'said'),
+    [
+        ('', '40 measurements came in motion, hardly any at a stop: stop at each pose'),
+        ('ur_', 'waiting for joint states, set joint_names? '),
+    ],
+)
+def test_what_gave_no_pose_is_in_the_short_answer(cell, recording, prefix, said):
+    """The middle was cut out of the message, and the cause with it."""
+    some = part(recording, 0.0, 10.0)
+    for k, message in enumerate(some['joint_states']):
+        message.name = [prefix + name for name in message.name]
+        message.position = [0.002 * k] * len(message.name)
+    cell.play(some)
+    answer = cell.refused('identify')
+    assert len(answer.message) <= 200
+    assert answer.message.startswith(f'no poses to fit ... {said}')
+
+
 def test_clocks_that_disagree_are_to_be_set_first(unsearched, cell, recording):
     session, (joints, poses) = cell.node.session, part(recording, 0.0, 12.0).values()
     come = sorted([*joints, *poses], key=stamp_ns)  # as they arrive, whatever their stamps

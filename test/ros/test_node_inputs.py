@@ -32,7 +32,8 @@ def test_an_overridden_qos(tmp_path, recording):
         )
         cell.spin_until(lambda: heard and said in heard[-1].status[0].message)
         assert heard[-1].status[0].level == DiagnosticStatus.WARN
-        assert cell.refused('identify').message.startswith(f'{said} ... full text: ')
+        short = f'no poses to fit; {said} ... full text: '
+        assert cell.refused('identify').message.startswith(short)
         for topic, policy in (
             ('/joint_states', ReliabilityPolicy.RELIABLE),
             ('/measured_pose', ReliabilityPolicy.BEST_EFFORT),
@@ -61,7 +62,8 @@ def test_a_topic_of_another_type_is_told(cell):
     assert heard[-1].status[0].level == DiagnosticStatus.WARN
     cell.spin_until(lambda: status and said in status[-1].data)  # the operator reads no other
     answer = cell.refused('identify')
-    assert answer.message.startswith(f'{said}: set type in sources ... full text: ')
+    short = f'no poses to fit; {said}: set type in sources ... full text: '
+    assert answer.message.startswith(short)
     assert 'no poses to fit' in cell.in_full(answer)
     other.destroy_node()
     cell.spin_until(lambda: said not in heard[-1].status[0].message)
