@@ -68,8 +68,6 @@ def find_delay(
     grid = np.arange(begin, end, STEP)
     coarse = np.interp(grid, joint_times, np.arange(len(joint_times)))
     known_motion = np.diff(joint_times, append=np.inf)[coarse.astype(int)] <= max_gap
-    if known_motion.sum() * STEP < LEAST_MOTION:
-        return None
     nearest = np.unique(np.round(coarse).astype(int))
     if len(nearest) < TELLING:  # a gap
         return None
