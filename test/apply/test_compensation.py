@@ -289,6 +289,7 @@ def test_approaches_are_the_last_moves():
         ({'largest_position_error': 50.0}, r'at most 1, not 50 .*\[m\]'),
         ({'tool': (0.0, 0.0)}, r'tool must be of type .* not \(0.0, 0.0\)'),
         ({'tool': (0.0, np.inf, 0.0)}, 'tool must be within 5 m'),
+        ({'tool': (0.0, -5.1, 0.0)}, 'tool must be within 5 m'),
         ({'tool': (0.0, 0.0, 150.0)}, 'tool must be within 5 m, not .*: 150 mm is 0.15'),
     ],
 )

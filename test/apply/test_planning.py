@@ -136,6 +136,9 @@ def test_wrong_arguments_are_refused():
     for speeds in (np.ones(1), np.append(np.zeros(1), np.ones(len(q.T) - 1))):
         with pytest.raises(ConfigError, match=r'velocities must be \d positive numbers'):
             planning.plan(design, q, q, 5, velocities=speeds)
+    for chosen in (np.arange(4), np.array([0, 1, 2, 3, 20])):
+        with pytest.raises(ConfigError, match='chosen must be 5 numbers from 0 to 19, not'):
+            planning.plan(design, q, q, 5, chosen=chosen)
 
 
 def measured_problem(name, session):

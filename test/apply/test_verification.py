@@ -262,6 +262,10 @@ def test_a_device_that_stands_elsewhere(cell, arm):
     assert 'moved' not in in_words(same)
     anew = 'base refitted, before and after alike'
     assert (anew in in_words(found), 'refitted' in in_words(same)) == (True, False)
+    both = ((name, getattr(arm, name)) for name in ('chain', 'before'))
+    known = replace(arm, **{name: each.with_frame('base_2', each.base) for name, each in both})
+    one_of_two = verify(known, [measured(true, joints), replace(*seen, base='base_2')], 3e-4)
+    assert one_of_two.common < 0.01
 
 
 @pytest.mark.parametrize('oriented', [True, False])

@@ -147,6 +147,15 @@ def test_two_sessions_are_of_one_arm_unless_each_fits_far_better_alone(change, t
     assert bool(found) == bool(told)
 
 
+@pytest.mark.parametrize('error', [InputError('too few'), np.linalg.LinAlgError()])
+def test_an_arm_that_no_freer_fit_confirms_may_be_another(error, monkeypatch):
+    def fit(problem):
+        raise error
+
+    monkeypatch.setattr(plausibility, 'fit', fit)
+    assert plausibility._imitated(None, None)
+
+
 @pytest.mark.parametrize('change', [{'rule': Rule.ENCODER}, {'position': 1.0}])
 def test_no_lag_is_sought_in_what_is_explained(change):
     seen = SimpleNamespace(velocity=None)

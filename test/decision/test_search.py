@@ -157,7 +157,7 @@ def searched(monkeypatch):
         hidden = [tuple(one for one in suspects if one.what in pair) for pair in pairs]
         monkeypatch.setattr(mistakes, 'suspects', lambda *_: suspects)
         monkeypatch.setattr(mistakes.orders, 'in_any_order', lambda *_: ())
-        monkeypatch.setattr(mistakes, 'hidden', lambda *_: hidden)
+        monkeypatch.setattr(mistakes, 'hidden', lambda chain, others: hidden)
         monkeypatch.setattr(mistakes, 'trial_of', trial_of)
         monkeypatch.setattr(mistakes, 'refine_trial', lambda problem, trial: trial)
 

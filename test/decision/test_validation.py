@@ -150,6 +150,14 @@ def test_outliers_that_the_correction_causes_are_no_gross_errors(rng, size):
         assert rules_of(after + change, after, judged) == {Rule.GAIN_WITH_OUTLIERS}
 
 
+def test_gross_errors_that_grow_a_little_are_not_caused(rng):
+    """Of twice the size of the correction, and by chance rather against it."""
+    change = np.full((40, 3), 2e-4)
+    after = 1e-4 * rng.normal(size=(40, 3))
+    change[:10], after[:10] = 1e-3, [2e-3, -2e-3, -1.8e-3]
+    assert rules_of(after + change, after, np.arange(40) >= 10) == set()
+
+
 @pytest.mark.parametrize(('grown', 'rules'), [(8e-3, set()), (1e-2, {Rule.GAIN_WITH_OUTLIERS})])
 def test_a_pose_that_was_set_aside_may_not_lose_more_than_all_others_gain(grown, rules):
     """Its squares may grow as much by chance: 39 poses gain 0.1 mm each."""

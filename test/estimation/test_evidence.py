@@ -13,6 +13,7 @@ from calib_ros.estimation import evidence
 from calib_ros.estimation.considered import considered
 from calib_ros.estimation.evidence import Inference, _device
 from calib_ros.estimation.fitting import fit
+from calib_ros.estimation.joint_errors import Unmodelled
 from calib_ros.estimation.posterior import Posterior, size_group
 from calib_ros.estimation.sizes import SPREAD, TYPICAL, Evidence
 from calib_ros.estimation.system import System
@@ -215,6 +216,25 @@ def test_what_is_held_nominal_is_as_uncertain_as_others_are(rng):
     for whole, part in ((after.offsets, before.offsets), (after.shift, before.shift)):
         np.testing.assert_array_equal(whole, [*part, 0.0, 0.0])
     np.testing.assert_array_equal(after.device, [*before.device, [0.0, 0.0], [0.0, 0.0]])
+
+
+def test_wider_errors_are_larger_in_every_term(rng):
+    """Waves count in units of a size that grows with them, and parameters follow them."""
+    root, mean = rng.normal(size=(4, 4)), rng.normal(size=4)
+    covariance, usual = root @ root.T, told(rng)
+    term = 0.25, mean, covariance
+    before = replace(usual, mixture=(term,), unmodelled=Unmodelled(1.0, 2.0, 3.0))
+    after = before.widened(2.0)
+    np.testing.assert_allclose(after.square, 4.0 * before.square)
+    assert after.unmodelled.sizes == {'turns': 2.0, 'tilts': 4.0, 'waves': 6.0}
+    more = np.zeros((4, 4))
+    more[:3, 3] = more[3, :3] = followed = covariance[:3, 3]
+    more[:3, :3] = 3.0 * (np.outer(followed, followed) / covariance[3, 3] + before.square)
+    assert after.rival is None
+    for weight, found, wider in (*after.mixture, replace(before, rival=term).widened(2.0).rival):
+        assert weight == 0.25
+        np.testing.assert_allclose(found, [*mean[:3], 0.5 * mean[3]])
+        np.testing.assert_allclose(wider, covariance + more)
 
 
 def test_the_expected_error_is_that_of_shift_and_covariance(rng):

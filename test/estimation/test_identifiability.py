@@ -160,6 +160,17 @@ def test_a_trade_is_named_though_a_fitted_parameter_shows_nowhere():
     assert independent(factor, ('b', 'hidden', 'a')) == ('b', 'a')
 
 
+def test_a_trade_is_named_beside_one_of_far_larger_amounts():
+    """Of two fitted axes nearly parallel a small difference takes thousandfold turns."""
+    a, b, c = np.eye(3)
+    factor = np.stack([a, a + 1e-4 * b, c, b, 2.0 * c], axis=1)
+    names = ('one', 'near', 'other', 'across', 'twice')
+    assert trades(factor.T @ factor, names, names[:3]) == {
+        'across': ['one', 'near'],
+        'twice': ['other'],
+    }
+
+
 @pytest.mark.parametrize(
     ('diagonal', 'poses', 'o1', 'o2', 'o3', 'o4', 'o5'),
     [

@@ -119,6 +119,10 @@ def test_normal_equations_and_triangular_factor_agree_over_blocks():
     left = residuals(true, seen)
     cost = ((left.position / 1e-4) ** 2).sum() + ((left.orientation / 3e-4) ** 2).sum()
     assert normal.cost == pytest.approx(cost, rel=1e-10)
+    few = System((Samples(seen.select(np.arange(2)), 1e-4, 3e-4),))  # fewer rows than parameters
+    factor, matrix = triangular_factor(true, names, few), normal_equations(true, names, few).matrix
+    assert factor.shape == matrix.shape
+    np.testing.assert_allclose(factor.T @ factor, matrix, atol=1e-12 * scale.max() ** 2)
 
 
 def dampings(monkeypatch, gains):

@@ -14,7 +14,7 @@ from fits import UR10E as UR, measured_arm
 
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.matrices import unpacked_matrix
-from calib_ros.errors import ConfigError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
@@ -35,6 +35,17 @@ def found():
     owners = {'base': ('', False, False, 'tracker'), 'tool': ('', False, False, 'ball')}
     result = identify(Problem(UR, seen, effects=('gravity',), world_frame='tracker'))
     return Calibration.of(result, {'robot_serial': '7'}, owners)
+
+
+def test_a_device_of_the_name_of_anothers_frame_has_a_frame_of_its_own():
+    owners = {'base': ('', False, False, 'tracker'), 'tool': ('', False, False, '')}
+    arm = Calibration(UR, UR, owners=owners)
+    new = {'base_2': owners['base'], 'base': ('', False, False, 'camera')}
+    assert arm.frames_of(new) == {'base_2': 'base', 'base': 'base (camera)'}
+    seen = Observations.from_arrays(np.zeros((1, 6)), np.zeros((1, 3)))
+    told = re.escape('the frames base (tracker), tool, not base (camera): name devices')
+    with pytest.raises(InputError, match=told):
+        arm.require_frames([seen.changed(base='base (camera)')])
 
 
 def test_in_sockets_it_holds_up_to_its_former_error():

@@ -119,6 +119,7 @@ def test_errors_that_the_model_lacks_do_not_spoil_an_update(seed):
     done = recalibrate(first, problem(true, 20, seed + 100), 0.0)
     assert done.accepted
     assert done.after.rms_mm < 1.02 * done.before.rms_mm
+    assert done.calibration.chain.effects == first.chain.effects
 
 
 @pytest.mark.parametrize('stated', [True, False])

@@ -9,7 +9,7 @@ from recorded import TYPESTORE, joint_state, point_stamped, pose_stamped
 from calib_ros import CalibrationSession, Settings, load_chain
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.kinematics.se3 import to_quat
-from calib_ros.sampling.batches import feed
+from calib_ros.sampling.batches import batches, feed
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sources import Source
 from calib_ros.sampling.streams import Stream
@@ -117,6 +117,17 @@ def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
     many.finish()
     assert outcome(one) == outcome(many)
     assert one.samples
+
+
+def test_large_messages_are_batches_of_a_few(monkeypatch):
+    """Images by the thousand would fill the memory."""
+    monkeypatch.setattr('calib_ros.sampling.batches.LARGEST_TABLE', 100)
+    messages = [(TRACKER, bytes(size)) for size in (1, 1, 99, 60, 60, 1, 101, 1)]
+    found = list(batches(iter(messages)))
+    assert [[len(data) for _, data in batch] for batch, _ in found] == [
+        *([1, 1, 99], [60, 60], [1, 101], [1])
+    ]
+    assert not any(error for _, error in found)
 
 
 def test_a_damaged_message_is_told_and_the_others_are_taken():

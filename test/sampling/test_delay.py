@@ -122,7 +122,8 @@ def test_a_target_that_was_carried_to_the_arm_stays_in_the_account_alone():
         told(session, joint_times[now], joints[now], *(each[part] for each in given))
         assert ('are joint states frozen?' in session.status()) == part[0]
     session.finish()
-    assert 'joint states stood still' in ''.join(session.warnings)
+    (stood,) = [each for each in session.hints if 'joint states stood still' in each.text]
+    assert (stood.status, stood.explains) == ('', False)
 
 
 @pytest.mark.parametrize('last', [9.9, 10.25, None])  # at rest, on the way, never

@@ -40,6 +40,7 @@ def test_it_is_what_the_identification_finds(oriented, seed):
     batch = identify(session().problem_of(samples))
     assert apart(found.estimate.chain, batch.chain, rng) < 0.05 * NOISE[0]
     assert found.estimate.noise == pytest.approx(1.0, abs=0.15)
+    assert found.estimate.misfit == pytest.approx(found.estimate.noise * NOISE[0], rel=0.3)
     predicted = np.sqrt(np.mean(batch.predicted_sigma() ** 2))
     assert found.estimate.sigma == pytest.approx(predicted, rel=0.25)
     assert found.suspicious == ()

@@ -60,6 +60,23 @@ def test_the_rotation_of_a_spike_does_not_count(rng):
         np.testing.assert_allclose(sample.rotation, np.eye(3), atol=1e-12)
 
 
+@pytest.mark.parametrize('kind', ['distance', 'eye_in_hand', 'images'])
+def test_only_a_target_seen_from_outside_is_a_place(kind):
+    assert POSE.is_place
+    assert not POSE._replace(**{kind: True}).is_place
+
+
+def test_images_of_a_stop_have_the_stamp_of_the_middle_one():
+    values = np.full((10, ROW_WIDTH), np.nan)
+    values[:, 0] = np.arange(10)
+    made, still = Sampler(np.array([True]), 100), np.zeros((10, 1))
+    found = Found(POSE._replace(images=True), np.zeros(10, int), 10 + np.arange(10), values)
+    begins = np.array([0, 3])
+    made.add(list(made.samples(found, Motion(still), begins, still[begins], 0.0, NOISE)))
+    known = [(each.stamp_ns, each.images) for each in made.take()[0]]
+    assert known == [(11, (0, 1, 2)), (16, (3, 4, 5, 6, 7, 8, 9))]
+
+
 def test_a_delay_is_taken_off_the_stamps_of_measurements_alone():
     joints = Piece(('j1',), np.array([0, 4]), np.array([70, 90]), np.zeros((2, 1)))
     poses = Piece(POSE, np.array([1, 2]), np.array([80, 100]), np.zeros((2, ROW_WIDTH)))

@@ -44,11 +44,11 @@ def test_a_cubic_motion_is_met_exactly(seed, even):
 
 
 def test_a_cubic_does_not_reach_over_a_pause_in_the_samples():
-    """A joint that was at rest, a hole, and another rest: nothing beyond the two is made up."""
-    made = filled([(0, (0, 0)), (2, (0, 0)), (4, (0, 0)), (90, (1, 1)), (92, (1, 1))])
+    """By the speed before it the joint would pass beyond both ends, and come back."""
+    made = filled([(0, (-2, 0)), (2, (-1, 0)), (4, (0, 0)), (90, (1, 1)), (92, (1, 1))])
     motion = at(made, *range(4, 91))
-    assert motion.joints.min() >= 0.0
-    assert motion.joints.max() <= 1.0
+    straight = np.arange(87)[:, np.newaxis] / 86.0
+    np.testing.assert_allclose(motion.joints, np.repeat(straight, 2, axis=1), atol=1e-12)
 
 
 def test_within_a_stop_nothing_of_the_moves_beside_it_shows():
