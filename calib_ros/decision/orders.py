@@ -93,7 +93,7 @@ def in_turn(
 def _blocks(problem: Problem, arm: Chain, seen: Observations, most: float) -> Index:
     """Return numbers (N,) of blocks of rows: one ends where its frames fit no more."""
     blocks, begin = np.zeros(len(seen), dtype=np.intp), 0
-    while begin + 2 * IN_A_FRAME <= len(seen):
+    while begin + 2 * IN_A_FRAME <= len(seen) <= MOST_SEARCHED:
         found = in_frames(problem, arm, (seen.select(begin + np.arange(2 * IN_A_FRAME)),)).chain
         later = seen.select(slice(begin, None))
         far = sample_errors(found, later, flange(found, later)) > most
