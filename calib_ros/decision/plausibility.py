@@ -338,7 +338,8 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
     image share its pose, so each image counts for six freedoms. Outliers tell nothing: towards the
     plane of the camera, intrinsics move a point without bound.
     """
-    if not result.converged or (result.step is not None and result.step.harmful):
+    seen = any(each.pixels is not None for each in problem.sets)
+    if not (seen and result.converged) or (result.step is not None and result.step.harmful):
         return '', False
     images: Counter[str] = Counter()
     pairs = zip(problem.sets, result.distances, strict=True)
