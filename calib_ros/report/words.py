@@ -151,7 +151,8 @@ def error_meaning(result: Identification) -> str:
             'errors of distances and touched planes are along one direction: position errors in '
             'space are about 1.7 times as large if alike in all directions'
         )
-    return 'errors of corners are the shortest shifts that explain them' if result.images else ''
+    words = 'the error of a corner is the shortest shift in space that explains its pixels'
+    return words if result.images else ''
 
 
 def _named(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
