@@ -30,8 +30,8 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
     lines += [f'**{in_markdown(verdict.heading)}**', '']
     lines += _paragraphs(verdict.gain, *verdict.text)
     for reason in report.advice:
-        lines += _section(reason.heading, reason.meaning, f'What was found: {reason.refusal}')
-        lines += _numbered(reason.steps) if reason.steps else []
+        lines += _section(reason.heading, reason.meaning, reason.found)
+        lines += ['**What to do:**', '', *_numbered(reason.steps)] if reason.steps else []
     if report.advice:
         lines += _paragraphs(*report.steps)
     elif report.steps:

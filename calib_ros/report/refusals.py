@@ -34,6 +34,11 @@ class Advice:
     sound: bool = False  # whether the arm shows no errors
     unless: tuple[str, ...] = ()  # for each step, when it is needless
 
+    @property
+    def found(self) -> str:
+        """Return what was found, as a sentence."""
+        return f'What was found: {self.refusal}' + '.' * (self.refusal[-1:] not in '.?')
+
 
 MARKED = re.compile(r'^\d\. (?:<!-- unless (\w+) -->)?', re.MULTILINE)
 

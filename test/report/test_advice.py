@@ -15,6 +15,7 @@ from calib_ros.decision.diagnosis import Diagnosis
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.undoing import Suspect
 from calib_ros.report import advice, refusals
+from calib_ros.report.markdown import markdown
 from calib_ros.report.reports import advice_of
 
 
@@ -156,13 +157,15 @@ def test_a_refused_page_says_why_and_what_to_do():
     problem = Problem(UR, replace(rows, positions=rows.positions + rng.normal(0, 1e-3, (40, 3))))
     result = identify(problem)
     assert not result.accepted
-    page = page_of(report_of(problem, result))
+    report = report_of(problem, result)
+    page = page_of(report)
     order = ('Not accepted', 'Why it was refused', 'What to do:', 'Accuracy of the')
     where = [page.text.index(words) for words in order]
     assert where == sorted(where)
     for each in advice.advice(result.refusals):
         assert each.heading in page.text
-        assert each.refusal in page.text
+        assert f'{each.refusal}.' in page.text
+        assert f'{each.found}\n\n**What to do:**\n\n1. ' in markdown(report, {})
     assert 'none: not accepted' in page.text
     assert 'map' not in page.data['figures']
 
