@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib_ros.estimation.levels import LARGEST_SCALE
+from calib_ros.estimation.levels import LARGEST_SCALE, SCALE
 
 
 def out_of_scale(scale: float, printed: bool = False, checked: bool = False) -> str:
@@ -22,12 +22,12 @@ def out_of_scale(scale: float, printed: bool = False, checked: bool = False) -> 
             'board, again'
         )
     text = f'{grown}, as if the measuring device were out of scale; then'
-    check = 'If a known length shows that its'
+    check, what, usual = 'If a known length shows that its', 'scale of the device', SCALE
     if printed:
-        check = 'Measure the print; if its'
+        check, what, usual = 'Measure the print; if its', 'size of the board', LARGEST_SCALE
         text = f'{grown}, as if the board were stated too {size}; then'
-        if abs(scale) < LARGEST_SCALE:  # as arms do
-            text = 'the size of the board is not known well enough:'
+    if abs(scale) < usual:  # as devices have, or arms
+        text = f'the {what} is not known well enough:'
     return (
         f'{text} the correction may make the arm worse. {check} scale is right, set sigma_scale '
         '(--sigma-scale) to its accuracy'

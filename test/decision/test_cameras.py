@@ -137,6 +137,8 @@ def test_a_checked_board_by_which_the_whole_arm_grows_is_refused(size):
 def test_a_board_by_which_hardly_an_arm_grows_is_not_said_to_be_of_another_size():
     """A good SCARA was refused as lengths had shrunk alike, by 0.00049 %."""
     assert out_of_scale(9e-4, printed=True).startswith('the size of the board is not known')
+    assert out_of_scale(6e-6).startswith('the scale of the device is not known well enough: the')
+    assert 'grow alike, by 0.011 %, as if the measuring device' in out_of_scale(1.1e-4)
     assert 'shrink alike, by 0.11 %, as if' in out_of_scale(-1.1e-3, printed=True)
 
 
