@@ -65,11 +65,13 @@ def in_turn(
     The arm fits each alone within `most` [m]. They are told apart by their places among the rows
     of one stop, else among all, or as three or more blocks of rows. Each visits enough
     configurations, as far apart as those of all: frames explain few of them, or those of one
-    place, whatever is wrong. The chain file holds frames of one of them only.
+    place, whatever is wrong. The chain file holds frames of one of them only; if those of all rows
+    would do, it holds wrong ones.
     """
-    if any(each.pixels is not None for each in problem.sets):
-        return None
     arm = replace(nominal, base=None, tool=None, frames=())
+    images = any(each.pixels is not None for each in problem.sets)
+    if images or in_frames(problem, arm, (seen,)).error <= most:
+        return None
     rows, least = np.arange(len(seen)), np.ptp(seen.joints, axis=0) / 2.0
     begins = np.flatnonzero(np.diff(seen.stops, prepend=-1))
     blocks = _blocks(problem, arm, seen, most)

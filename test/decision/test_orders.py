@@ -133,6 +133,16 @@ def test_targets_one_after_the_other_are_named_also_if_the_first_is_held(count, 
     assert str(found).startswith(what)
 
 
+@pytest.mark.parametrize('name', ['base_left', 'tool_left'])
+def test_a_frame_of_a_named_device_or_target_held_in_a_wrong_place_is_not_several(name):
+    """Each half of the rows fits in frames of its own, but so do all of them."""
+    _, true, seen = measured_arm(2, 36, chain=SCARA)
+    frame, seen = true.frame(name[:4]), replace(seen, **{name[:4]: name})
+    wrong = frame.matrix + np.pad(np.full((3, 1), 0.05), ((0, 1), (3, 0)))
+    held = SCARA.with_frame(name, replace(frame, matrix=wrong, fixed=True))
+    assert ' in turn' not in str(diagnose(Problem(held, seen)))
+
+
 @pytest.mark.parametrize('kind', ['a loop of six poses', 'three places in turn'])
 def test_few_configurations_or_places_in_turn_are_not_several_arms(kind):
     """Frames explain three poses each, or those of one place, beside any error of a joint."""
