@@ -14,7 +14,10 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 
 @dataclass(frozen=True, eq=False)
 class Moving:
-    """Columns switched on together: a frame of some sets, zeros of joints, or the load."""
+    """Columns switched on together: frames of some sets, zeros of joints, or the load.
+
+    A frame among them may be `held`: then from the first pose on.
+    """
 
     what: str
     kind: str
@@ -60,4 +63,5 @@ def groups_of(problem: Problem) -> list[Moving]:
 def _together(groups: Sequence[Moving]) -> Moving:
     names = tuple(name for each in groups for name in each.names)
     sets = tuple(number for each in groups for number in each.sets)
-    return Moving(', '.join(each.what for each in groups), groups[0].kind, names, sets)
+    held = any(each.held for each in groups)
+    return Moving(', '.join(each.what for each in groups), groups[0].kind, names, sets, held)

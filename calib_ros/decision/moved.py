@@ -100,7 +100,7 @@ class Step:
         """Return the reason to refuse a result."""
         size = self._size
         if self.held:
-            off = f'the {self.what} held by the chain file is off {size}'
+            off = f'the {self.what} held by the chain file {self._are} off {size}'
             return Reason(Rule.MISTAKE, f'{off}: correct it, or remove fixed: true there')
         thing, of = self.thing, f' ({self.what})'
         if self.kind in ZEROS:

@@ -70,9 +70,9 @@ def find_step(fitted: Fitted) -> Step | None:
     if bends:
         scan, found = _searched(fitted, loaded=True)
     if found is not None:
-        if scan.drifts(found):
-            creeps = found.stop and found.group.kind in IN_THE_CELL
-            if not creeps or fitted.problem.sets[found.group.sets[0]].socket:
+        if found.stop and scan.drifts(found):
+            in_cell = found.group.kind in IN_THE_CELL
+            if not in_cell or fitted.problem.sets[found.group.sets[0]].socket:
                 return None
             found = replace(found, size=2.0 * found.size, slow=True)  # the halves' means differ
         return scan.described(found)
@@ -357,9 +357,11 @@ class _Scan:
         most = largest_of(problem) if unit == 'm' else problem.largest_angle
         joints = np.concatenate([each.joints for each in sets])
         unused = [where for where, side in sides if found.stop and not weights[side].any()]
-        seen = problem.sets[of_set]
+        seen, model = problem.sets[of_set], problem.model
+        frames = [] if found.stop else dict.fromkeys(Parameter(name).owner for name in group.names)
+        held = ', '.join(name for name in frames if model.frame(name).fixed)
         return Step(
-            what=group.what,
+            what=held or group.what,
             kind=group.kind,
             thing=thing_of(group.kind, seen, several=', ' in group.what),
             set=of_set,
@@ -371,7 +373,7 @@ class _Scan:
             unused=''.join(unused),
             where=place_of(problem, of_set, int(sample)),
             apart=size <= most and _separable(joints, later),
-            held=not found.stop,
+            held=bool(held),
             slow=found.slow,
             longer=longer,
         )
