@@ -21,7 +21,9 @@ from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import ALIKE, MOST_OUTLIERS
+from calib_ros.estimation.posterior import Posterior
 from calib_ros.estimation.problem import Problem
+from calib_ros.kinematics import effects
 from calib_ros.settings import EXCEPTION
 from calib_ros.shown import some
 
@@ -114,7 +116,9 @@ def _idle_joints(problem: Problem) -> str:
     return found or (level if least < DEGENERATE else '')
 
 
-def oddities(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:
+def oddities(
+    problem: Problem, posterior: Posterior, step: Step | None, coarse: Mapping[str, float]
+) -> tuple[str, ...]:
     """Return what is suspicious about a result but no reason to refuse it.
 
     `coarse` holds the steps [rad or m] of rounded joint values.
@@ -135,4 +139,25 @@ def oddities(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -
                 f'"parallel" in the chain file {does} {", ".join(wrong)}, but the axes connected '
                 f'there are {are}parallel: leave "parallel" out to derive it'
             )
-    return tuple(found)
+    return tuple(filter(None, (*found, _one_sided(problem, posterior))))
+
+
+def _one_sided(problem: Problem, posterior: Posterior) -> str:
+    """Return which joints moved to all poses from one side, and the play expected of them."""
+    signs = [each.approach for each in problem.sets if each.approach is not None]
+    if not signs:
+        return ''
+    moves, found = np.concatenate(signs), list[str]()
+    same = moves.min(axis=0) * moves.max(axis=0) >= 0.0
+    play = effects.members(problem.chain, 'backlash')
+    for name in (play[k] for k in np.flatnonzero(same) if play[k] not in problem.given):
+        if name in posterior.names:
+            k = posterior.names.index(name)
+            size = 1e3 * float(np.sqrt(posterior.square[k, k]))
+            found += [f'{name.owner} (± {size:.2g} m{name.unit})'] if round(size, 3) else []
+    return bool(found) * (
+        f'{", ".join(some(found))} moved to all poses from the same side, which hides play: '
+        'expected errors include as much as is likely. Approach poses from both sides to measure '
+        'it; if the same side is also used later, it does no harm: --model backlash --priors '
+        '"*.backlash=1e-6"'
+    )

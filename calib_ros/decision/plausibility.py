@@ -262,8 +262,8 @@ def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | 
     if played > share:
         return (
             f'the joints have play, which explains {100.0 * played:.0f} % of the residuals: '
-            'reach each pose from the same side, or fit the play (model auto) with the signs of '
-            'the last moves (s1 ... sn)'
+            'fit the play (model auto) with the signs of the last moves (s1 ... sn), or reach '
+            'poses from the same side, in use as well'
         ), None
     return (
         f'poses lie towards the previous stop, which explains {100.0 * share:.0f} % of the '

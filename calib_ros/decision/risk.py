@@ -22,7 +22,12 @@ from scipy import special
 
 from calib_ros.decision.region import Region
 from calib_ros.estimation.gain import inverse_root
-from calib_ros.estimation.joint_errors import axis_parameters, turns_and_tilts, wobble_columns
+from calib_ros.estimation.joint_errors import (
+    NOTHING,
+    axis_parameters,
+    turns_and_tilts,
+    wobble_columns,
+)
 from calib_ros.estimation.levels import KNOWN
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.posterior import MixtureTerm, Posterior
@@ -48,9 +53,9 @@ def region_of(
     measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
     drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
     judge = _Judge(posterior, *ends, freedom)
-    rows = judge.rows(np.concatenate([drawn, measured]))
-    known = rows[: len(posterior.names)]
-    squares = np.einsum('pcn,pcn->n', np.tensordot(posterior.square, known, 1), known)
+    joints = np.concatenate([drawn, measured])
+    rows, model = judge.rows(joints), ErrorModel(posterior.chain, posterior.names, *ends)
+    squares, _ = NOTHING.variances(model, posterior.square, joints, np.s_[:3])
     sizes = np.sqrt(np.maximum(squares, 0.0))  # of the expected errors
     sizes *= 1.0 + HALF_THE_DIGITS  # as rounded, also in the record
     far, limit = sizes[:SOME_POSES], float(sizes[SOME_POSES:].max())

@@ -93,7 +93,7 @@ def held_out_excess(
     noise = fitted.noise.position * _rms_mm(squares, judged.deciding)
     if found <= ALIKE * noise:  # noise alone, as nearly always
         return 0.0, 1.0
-    squares = [posterior.expected(each.joints, each.base, each.tool) for each in sets]
+    squares = [posterior.expected(s.joints, s.base, s.tool, s.approach) for s in sets]
     expected = _rms_mm(squares, judged.deciding)
     if not expected:  # computed, without noise
         return 0.0, 1.0
@@ -110,7 +110,8 @@ def _alike(posterior: Posterior, sets: Sequence[Observations]) -> float:
     few, seen = [each.spread() for each in sets], []
     for each in few:
         model = ErrorModel(posterior.chain, posterior.names, each.base, each.tool)
-        seen.append(model.jacobian(each.joints)[:, :3].reshape(-1, len(posterior.names)))
+        rows = model.jacobian(each.joints, each.approach)[:, :3]
+        seen.append(rows.reshape(-1, len(posterior.names)))
     rows = np.concatenate(seen)
     shared = posterior.square @ (rows.T @ rows)
     return float(np.trace(shared @ shared) / np.trace(shared) ** 2)

@@ -6,8 +6,12 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Sequence
+from itertools import compress
+
+import numpy as np
 
 from calib_ros.estimation.levels import LARGEST_SCALE, OUT_OF_SCALE, PRINTED, SCALE
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.system import System
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -18,15 +22,25 @@ CONSIDERED = ('eccentricity', 'gravity')
 """Effects that any arm may have, fitted or not; moves of one joint hardly excite couplings."""
 
 
-def considered(chain: Chain, names: Sequence[str], fixed: Sequence[str] = ()) -> tuple[str, ...]:
+def considered(
+    chain: Chain,
+    names: Sequence[str],
+    fixed: Sequence[str] = (),
+    sets: Sequence[Observations] = (),
+) -> tuple[str, ...]:
     """Return the effects that an arm may have besides the named ones.
 
     DH parameters held at nominal by a `fixed` pattern may be off as well, and frames held by the
     chain file. Where eccentricity is fitted, waves of other orders look like it in part of a turn.
+    Joints may have play, of which only `sets` with signs of the last moves tell anything.
     """
     every = [name for group in CONSIDERED for name in effects.members(chain, group)]
     every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
     every += travels(chain)
+    signs = [each.approach for each in sets if each.approach is not None]
+    if signs:
+        known = np.abs(np.concatenate(signs)).max(axis=0)
+        every += compress(effects.members(chain, 'backlash'), known)
     fitted = [name for name in effects.members(chain, 'eccentricity') if name in names]
     for owner in dict.fromkeys(name.owner for name in fitted):
         every += [wave for order in (3, 4) for wave in effects.waves(owner, order)]

@@ -14,6 +14,7 @@ import numpy as np
 
 from calib_ros.estimation.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.effects import PLAY
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
@@ -63,14 +64,22 @@ class Unmodelled(NamedTuple):
         left = wobble_columns(tilts, joints) - np.tensordot(self.followed, own, (0, 0))
         return np.concatenate([self.turns * turns, self.tilts * tilts, self.waves * left])
 
-    def expected(self, model: ErrorModel, square: FloatArray, joints: FloatArray) -> FloatArray:
+    def expected(
+        self,
+        model: ErrorModel,
+        square: FloatArray,
+        joints: FloatArray,
+        approach: FloatArray | None = None,
+    ) -> FloatArray:
         """Return the expected squares (N, 6, 6) of pose errors [m, rad] at joint values (N, n).
 
-        In world axes, with expected squares (P, P) of the model's parameters.
+        In world axes, with expected squares (P, P) of the model's parameters. `approach` (N, n)
+        holds the signs of the preceding moves; without it joints with play come from either side.
         """
+        known = _from_either_side(model, square) if approach is None else square
         found = [
-            own @ square @ np.swapaxes(own, 1, 2) + off @ np.swapaxes(off, 1, 2)
-            for own, off in self._seen(model, joints)
+            own @ known @ np.swapaxes(own, 1, 2) + off @ np.swapaxes(off, 1, 2)
+            for own, off in self._seen(model, joints, approach)
         ]
         return np.concatenate(found)
 
@@ -78,6 +87,7 @@ class Unmodelled(NamedTuple):
         self, model: ErrorModel, square: FloatArray, joints: FloatArray, part: slice
     ) -> tuple[FloatArray, FloatArray]:
         """Return the traces (N,) of a `part` of `expected`: by the parameters, and by the rest."""
+        square = _from_either_side(model, square)
         known, beyond = list[FloatArray](), list[FloatArray]()
         for own, off in self._seen(model, joints):
             rows = own[:, part]
@@ -87,17 +97,24 @@ class Unmodelled(NamedTuple):
         return np.concatenate(known), np.concatenate(beyond)
 
     def _seen(
-        self, model: ErrorModel, joints: FloatArray
+        self, model: ErrorModel, joints: FloatArray, approach: FloatArray | None = None
     ) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Yield the columns (B, 6, P) of a model and (B, 6, K) of the joints, in blocks."""
         chain, count, some = model.chain, len(model.names), any(self.sizes.values())
         every = tuple(dict.fromkeys((*model.names, *(axis_parameters(chain) if some else ()))))
         joints, model = chain.joint_values(joints), ErrorModel(chain, every, *model.ends)
+        signs = np.ones_like(joints) if approach is None else approach
         for first in range(0, max(len(joints), 1), BLOCK):
-            block = joints[first : first + BLOCK]
-            jacobian = model.jacobian(block)
-            off = self.columns(chain, every, block, jacobian.T) if some else jacobian.T[:0]
+            block = np.s_[first : first + BLOCK]
+            jacobian = model.jacobian(joints[block], signs[block])
+            off = self.columns(chain, every, joints[block], jacobian.T) if some else jacobian.T[:0]
             yield jacobian[..., :count], off.T
+
+
+def _from_either_side(model: ErrorModel, square: FloatArray) -> FloatArray:
+    """Return expected squares (P, P) for random signs of moves: nothing else goes with play."""
+    rest = np.array([Parameter(name).kind not in PLAY for name in model.names], dtype=bool)
+    return np.asarray(square * (np.outer(rest, rest) | np.eye(len(rest), dtype=bool)))
 
 
 NOTHING = Unmodelled()

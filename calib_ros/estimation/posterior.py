@@ -55,13 +55,19 @@ class Posterior(Shown):
         """Return the expected squares (P, P) of the parameter errors."""
         return np.asarray(self.covariance + np.outer(self.shift, self.shift))
 
-    def expected(self, joints: FloatArray, base: str = 'base', tool: str = 'tool') -> FloatArray:
+    def expected(
+        self,
+        joints: FloatArray,
+        base: str = 'base',
+        tool: str = 'tool',
+        approach: FloatArray | None = None,
+    ) -> FloatArray:
         """Return the expected squares (N, 6, 6) of pose errors [m, rad] at joint values (N, n).
 
-        In world axes, unmodelled effects included.
+        In world axes, unmodelled effects included; `approach` as in `Unmodelled.expected`.
         """
         model = ErrorModel(self.chain, self.names, base, tool)
-        return self.unmodelled.expected(model, self.square, joints)
+        return self.unmodelled.expected(model, self.square, joints, approach)
 
     def widened(self, factor: float) -> Posterior:
         """Return it with all expected errors larger by a factor, but for those of the device."""

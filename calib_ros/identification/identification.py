@@ -91,8 +91,8 @@ def _identified(
     progress(2 / 3)
     validation, validated_by = validate(fitted, before.chain, explained)
     coarse, share = rounded_joints(problem), coupling_share(fitted)
-    more, doubts = considered(chain, names, problem.fixed), rounding_errors(problem, coarse)
-    inference = Inference(fitted, _size(fitted, share), more, doubts)
+    more = considered(chain, names, problem.fixed, problem.sets)
+    inference = Inference(fitted, _size(fitted, share), more, rounding_errors(problem, coarse))
     posterior, uncertainty = _inferred(inference)
     surprise, wider = held_out_excess(fitted, posterior, validation)
     uncertainty = replace(uncertainty, parts=wider**2 * uncertainty.parts)
@@ -123,7 +123,7 @@ def _identified(
         region=region,
         weak=_weak(problem, parameters),
         step=step,
-        remarks=oddities(problem, step, coarse),
+        remarks=oddities(problem, posterior, step, coarse),
         coupled=share > 0.0,
         surprise=surprise,
         images=sum(count_distinct(s.images) for s in problem.sets if s.pixels is not None),

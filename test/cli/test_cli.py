@@ -98,12 +98,17 @@ def test_the_corrected_chain_is_a_chain_that_predicts(run, written):
     ('storage', 'held_out', 'oriented'), [('mcap', TEST, True), ('sqlite3', 0, False)]
 )
 def test_a_table_and_its_bag_give_the_same(run, tmp_path, storage, held_out, oriented):
-    table = write_csv(tmp_path / 'cell.csv', rows_of(measured(oriented=oriented), held_out))
-    bag = tmp_path / 'bag'
+    seen, bag = measured(oriented=oriented), tmp_path / 'bag'
+    rows = rows_of(seen, held_out)
+    table = write_csv(tmp_path / 'cell.csv', rows)
     status, out, err = run('csv2bag', table, bag, '--chain', 'ur5e', '--storage', storage)
     assert (status, err) == (0, '')
     assert f'{TRAIN + TEST - held_out} poses to fit, {held_out} held out' in out
-    found = [run('identify', each, '--chain', 'ur5e', '--json') for each in (table, bag)]
+    moves = np.diff(seen.joints, axis=0, prepend=seen.joints[:1])
+    shown = np.sign(np.angle(np.exp(1j * moves)))  # by the bag, as the shorter way
+    signs = [{f's{k}': each for k, each in enumerate(row, 1)} for row in shown]
+    signed = write_csv(tmp_path / 's.csv', [r | s for r, s in zip(rows, signs, strict=True)])
+    found = [run('identify', each, '--chain', 'ur5e', '--json') for each in (signed, bag)]
     assert [(status, err) for status, _, err in found] == [(0, '')] * 2
     from_table, from_bag = (json.loads(out) for _, out, _ in found)
     assert_same_result(from_bag, from_table, 1e-9)

@@ -206,7 +206,8 @@ def test_a_gross_error_that_the_correction_makes_larger_by_chance_spoils_nothing
 )
 def test_a_chain_that_lists_the_wrong_axes_as_parallel_is_named(parallel, words):
     *_, seen = measured_arm(3, 30)
-    said = [*oddities(Problem(replace(UR10E, parallel=parallel), seen), None, {})]
+    problem = Problem(replace(UR10E, parallel=parallel), seen)
+    said = [*oddities(problem, identify(problem).posterior, None, {})]
     assert bool(said) == bool(words)
     assert all(any(each in text for text in said) for each in words)
 

@@ -322,6 +322,7 @@ def test_without_noise_and_expected_errors_nothing_is_widened(found):
         joints=np.zeros((2, 1)),
         base='base',
         tool='tool',
+        approach=None,
         covariances=lambda sigmas: np.zeros((2, 6, 6)),
     )
     problem = SimpleNamespace(judging=[nothing], sigma_position=1e-4, sigma_orientation=1e-4)
