@@ -153,7 +153,8 @@ class Evidence:
 
         One group differs at a time, up and down, by as much as makes means right to second order
         (unscented transform, Julier and Uhlmann 1997), weighted by their evidence. Groups of size
-        zero stay so, and so does the scale of the device.
+        zero stay so, and so does the scale of the device. Play, which frames and zeros make up for
+        if joints come from one side, is at most usual, or as large as most probable.
         """
         arms = np.array([name in TYPICAL for name in self._names], dtype=bool)
         some = np.flatnonzero(arms & (size > self._typical + np.log(LEAST_SIZE)))
@@ -161,6 +162,8 @@ class Evidence:
             return [(1.0, size)]
         steps = (np.sqrt(len(some) / slope) * np.eye(len(size)))[some]
         tried = self._within(size + np.stack([steps, -steps], axis=1).reshape(-1, len(size)))
+        play = np.array([name == 'backlash' for name in self._names])
+        tried = np.minimum(tried, np.where(play, np.maximum(size, self._typical), np.inf))
         unusual = (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(axis=1)
         likely = self._log_evidence(tried) - 0.5 * unusual
         upper = special.expit(likely[::2] - likely[1::2])

@@ -17,6 +17,7 @@ from calib_ros.decision.risk import region_of
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics import effects, se3
+from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.report.documents import as_document
@@ -331,6 +332,34 @@ def test_play_of_a_healthy_arm_is_not_corrected_as_an_error_of_its_zeros():
     assert not identify(Problem(UR10E, seen)).accepted
     unknown = identify(Problem(UR10E, replace(seen, approach=None)))
     assert unknown.accepted  # nothing tells
+
+
+GANTRY = Chain(
+    'gantry',
+    'standard',
+    (
+        Joint('x', 'prismatic', alpha=np.pi / 2, lower=0.0, upper=2.0),
+        Joint('y', 'prismatic', theta=np.pi / 2, alpha=np.pi / 2, lower=0.0, upper=1.5),
+        Joint('z', 'prismatic', lower=0.0, upper=1.0),
+        Joint('c', lower=-3.0, upper=3.0),
+    ),
+)
+
+
+def homed(true, rng):
+    """Return 60 poses of a gantry that returns home, into a corner, before each."""
+    q = GANTRY.random_joints(60, rng)
+    seen = measure(true, q, rng, 5e-5, 2e-4)
+    return replace(seen, approach=np.ones_like(q))
+
+
+def test_play_of_which_nothing_tells_is_of_the_usual_size():
+    """Base and tool make up for it, whatever its size: 10 mm were stated of a gantry."""
+    rng = np.random.default_rng(3)
+    found = identify(Problem(GANTRY, homed(faulty(GANTRY, Cell(), rng), rng)))
+    squares = found.pose_covariance(GANTRY.random_joints(200, rng))[:, :3, :3]
+    stated = np.sqrt(np.trace(squares, axis1=1, axis2=2).mean())
+    assert 3e-4 < stated < np.sqrt(2.0 * 3.0) * 3e-4 * 1.2  # twice the play, or none
 
 
 def test_who_states_that_play_does_no_harm_gets_small_errors_from_one_side():
