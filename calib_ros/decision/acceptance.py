@@ -148,16 +148,18 @@ def _one_sided(problem: Problem, posterior: Posterior) -> str:
     if not signs:
         return ''
     moves, found = np.concatenate(signs), list[str]()
-    same = moves.min(axis=0) * moves.max(axis=0) >= 0.0
+    known = np.median(np.abs(moves), axis=0) > 0.0  # of most poses
+    same = (moves.min(axis=0) * moves.max(axis=0) >= 0.0) & known
     play = effects.members(problem.chain, 'backlash')
     for name in (play[k] for k in np.flatnonzero(same) if play[k] not in problem.given):
         if name in posterior.names:
             k = posterior.names.index(name)
             size = 1e3 * float(np.sqrt(posterior.square[k, k]))
             found += [f'{name.owner} (± {size:.2g} m{name.unit})'] if round(size, 3) else []
+    stated = ','.join(dict.fromkeys(f'*.{name.kind}=1e-6' for name in play))
     return bool(found) * (
         f'{", ".join(some(found))} moved to all poses from the same side, which hides play: '
         'expected errors include as much as is likely. Approach poses from both sides to measure '
         'it; if the same side is also used later, it does no harm: --model backlash --priors '
-        '"*.backlash=1e-6"'
+        f'"{stated}"'
     )

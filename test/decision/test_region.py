@@ -362,6 +362,24 @@ def test_play_of_which_nothing_tells_is_of_the_usual_size():
     assert 3e-4 < stated < np.sqrt(2.0 * 3.0) * 3e-4 * 1.2  # twice the play, or none
 
 
+def test_the_remark_on_play_also_tells_how_to_state_that_of_linear_joints():
+    rng = np.random.default_rng(3)
+    seen = homed(faulty(GANTRY, Cell(), rng), rng)
+    (told,) = [each for each in identify(Problem(GANTRY, seen)).remarks if 'play' in each]
+    given = dict(each.split('=') for each in told.split('"')[1].split(','))
+    chain = GANTRY.with_effects(effects.members(GANTRY, 'backlash'))
+    priors = {name: float(value) for name, value in given.items()}
+    stated = identify(Problem(chain, seen, priors=priors))
+    assert not [each for each in stated.remarks if 'play' in each]
+
+
+def test_a_few_known_signs_do_not_tell_that_all_poses_came_from_the_same_side():
+    _, seen = approached(0.0, [*range(6)], seed=3)
+    few = np.where(np.arange(60)[:, np.newaxis] < 3, seen.approach, 0.0)
+    found = identify(Problem(UR10E, replace(seen, approach=few)))
+    assert not [each for each in found.remarks if 'play' in each]
+
+
 def test_who_states_that_play_does_no_harm_gets_small_errors_from_one_side():
     _, seen = approached(0.0, [*range(6)])
     chain = UR10E.with_effects(effects.members(UR10E, 'backlash'))
