@@ -154,8 +154,9 @@ def _one_sided(problem: Problem, posterior: Posterior) -> str:
     for name in (play[k] for k in np.flatnonzero(same) if play[k] not in problem.given):
         if name in posterior.names:
             k = posterior.names.index(name)
-            size = 1e3 * float(np.sqrt(posterior.square[k, k]))
-            found += [f'{name.owner} (± {size:.2g} m{name.unit})'] if round(size, 3) else []
+            size = float(np.sqrt(posterior.square[k, k]))
+            if size > EXCEPTION * effects.expected(name):
+                found.append(f'{name.owner} (± {1e3 * size:.2g} m{name.unit})')
     stated = ','.join(dict.fromkeys(f'*.{name.kind}=1e-6' for name in play))
     return bool(found) * (
         f'{", ".join(some(found))} moved to all poses from the same side, which hides play: '
