@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import fits
 import numpy as np
 import pytest
-from fits import NOISE, SCARA, SIGMAS, UR10E, along_path, at_stations, measured_arm
+from fits import NOISE, SIGMAS, UR10E, along_path, at_stations, measured_arm
 
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -336,49 +336,6 @@ def test_a_gross_error_at_the_begin_or_end_is_no_step(seed, row):
     assert result.step is None
     assert [outlier.sample for outlier in result.outliers] == [row % 40]
     assert result.accepted
-
-
-def test_a_base_held_in_a_wrong_place_is_no_step(rng):
-    true = arm(rng)
-    seen = measure(true, poses('random', rng), rng, *NOISE)
-    held = true.base.matrix.copy()
-    held[:3, 3] += [0.003, 0.0, 0.004]
-    chain = replace(UR10E, base=replace(true.base, matrix=held, fixed=True))
-    result = identify(Problem(chain, seen, **SIGMAS))
-    assert result.refusals[0].rule is Rule.MISTAKE
-    assert 'the base held by the chain file is off by' in result.refusals[0]
-
-
-@pytest.mark.parametrize(('held', 'in_turn'), [((0, 1, 2, 3), False), ((1, 3), True)])
-def test_bases_of_sessions_held_in_wrong_places_are_no_drift(held, in_turn):
-    """One after another they follow slow waves: a correction 1 mm off was accepted."""
-    rng = np.random.default_rng(1)
-    true, q = fits.arm(rng), UR10E.random_joints(100, rng)
-    seen = measure(true, q.mean(axis=0) + 0.2 * (q - q.mean(axis=0)), rng, *NOISE)
-    which = np.arange(100) % 4 if in_turn else np.arange(100) // 25
-    sets = [replace(seen.select(which == k), base=f'base_{k}') for k in range(4)]
-    chain = replace(UR10E, base=None, tool=None)
-    for k in held:
-        wrong = true.base.matrix.copy()
-        wrong[:3, 3] += rng.normal(scale=3e-4, size=3)
-        chain = chain.with_frame(f'base_{k}', replace(true.base, matrix=wrong, fixed=True))
-    refused = identify(Problem(chain, sets[0], more=sets[1:], **SIGMAS)).refusals[0]
-    bases = ', '.join(f'base_{k}' for k in held)
-    assert refused.startswith(f'the {bases} held by the chain file are off by')
-
-
-def test_a_held_base_is_off_by_what_shows_not_along_what_the_tool_makes_up_for(rng):
-    """Axes of a SCARA are parallel but for errors: some mm were told as 440, mostly of height."""
-    first, elbow, quill, spindle = SCARA.joints
-    nominal = replace(SCARA, joints=(first, elbow, spindle, quill))
-    true = fits.arm(rng, chain=nominal)
-    seen = measure(true, nominal.random_joints(60, rng), rng, *NOISE)
-    held = true.base.matrix.copy()
-    held[:3, :3] @= se3.exp_rotation(np.array([[2e-3, -2e-3, 0.0]]))[0]
-    chain = replace(nominal, base=replace(true.base, matrix=held, fixed=True))
-    step = find_step(fitting.fit(Problem(chain, seen, **SIGMAS)))
-    assert step.held
-    assert step.size < 0.01
 
 
 @pytest.mark.parametrize('what', ['load', 'joints', None])

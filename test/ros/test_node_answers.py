@@ -4,7 +4,6 @@
 
 import numpy as np
 import pytest
-import yaml
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
@@ -21,7 +20,7 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.errors import TooFewObservationsError
 from calib_ros.files.history import History
 from calib_ros.identification.records import nominal_document
-from calib_ros.kinematics.chain_file import calibration_record, dump_chain, load_chain, parse_chain
+from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.report.refusals import rules
 from calib_ros.report.words import REFUSED
 from calib_ros.ros.identifying import KEEP, NOT_FILED, ONE_BEFORE
@@ -362,26 +361,6 @@ def test_what_cannot_be_loaded_at_the_start_is_told_and_costs_nothing_else(
         assert node.session.calibration is None
         cell.play(part(recording, 0.0, 4.0), node=node)
         assert node.session.samples
-
-
-def test_the_settings_of_the_identification_are_saved_with_it(tmp_path, recording, monkeypatch):
-    """Whatever has been changed since, and though its report cannot be made."""
-    given = {'chain': 'ur10e', 'serial': '7', 'base_frame': 'base_link'}
-    with Cell(**given, data_dir=str(tmp_path)) as cell:
-        cell.play(topics(recording))
-        given |= {'folds': 4, 'largest_loss': 0.3, 'socket': 'A/1'}
-        cell.set_parameters({name: given[name] for name in ('folds', 'largest_loss', 'socket')})
-        cell.done('identify')
-        cell.set_parameters({'folds': 7, 'largest_loss': 0.2})
-        monkeypatch.setattr('calib_ros.report.page.render', None)
-        told = cell.log()
-        saved = cell.done('save')
-        (path,) = tmp_path.glob('*Z.yaml')
-        assert saved.message == f'saved to {path}'
-        cell.spin_until(lambda: any(f'the report of {path} is not' in m.msg for m in told))
-        of_all = yaml.safe_load(path.with_suffix('.settings.yaml').read_text())['/**']
-        assert calibration_record(path.read_text())['robot_serial'] == '7'
-        assert given.items() <= of_all['ros__parameters'].items()
 
 
 def test_outliers_are_named_by_number_and_stamp(cell, recording):

@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 from ros_cell import Cell, topics
 
 from calib_ros.errors import CalibrationError, ConfigError
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.chain_file import calibration_record, load_chain
 from calib_ros.ros import node as node_module
 from calib_ros.ros.arguments import launch_arguments
 from calib_ros.ros.command_line import refuse_ignored_files, typed
@@ -306,3 +306,23 @@ def test_the_parameter_file_applies_under_a_namespace(tmp_path, ended_by):
     given, names = ('serial:=0012', f'data_dir:={tmp_path}'), ('__ns:=/cell_2', '__node:=arm')
     assert ended_by(*given, file=path, spun=spun, names=names) == 0
     assert found == [('/cell_2/arm', 'meca500', '0012')]
+
+
+def test_the_settings_of_the_identification_are_saved_with_it(tmp_path, recording, monkeypatch):
+    """Whatever has been changed since, and though its report cannot be made."""
+    given = {'chain': 'ur10e', 'serial': '7', 'base_frame': 'base_link'}
+    with Cell(**given, data_dir=str(tmp_path)) as cell:
+        cell.play(topics(recording))
+        given |= {'folds': 4, 'largest_loss': 0.3, 'socket': 'A/1'}
+        cell.set_parameters({name: given[name] for name in ('folds', 'largest_loss', 'socket')})
+        cell.done('identify')
+        cell.set_parameters({'folds': 7, 'largest_loss': 0.2})
+        monkeypatch.setattr('calib_ros.report.page.render', None)
+        told = cell.log()
+        saved = cell.done('save')
+        (path,) = tmp_path.glob('*Z.yaml')
+        assert saved.message == f'saved to {path}'
+        cell.spin_until(lambda: any(f'the report of {path} is not' in m.msg for m in told))
+        of_all = yaml.safe_load(path.with_suffix('.settings.yaml').read_text())['/**']
+        assert calibration_record(path.read_text())['robot_serial'] == '7'
+        assert given.items() <= of_all['ros__parameters'].items()

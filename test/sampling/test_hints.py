@@ -277,10 +277,9 @@ def test_two_publishers_are_told_rather_than_what_comes_of_them():
 def test_other_values_with_the_same_stamp_are_told(of, other, count):
     made = heard(tour(15), 29.5, twice=of, other=other, precise=1e9)
     made.finish()
-    warnings = told(made)
+    kind, warnings = 'joint states' if of == 'joints' else of, told(made)
     assert len(warnings) == count
     for words in warnings:
-        kind = 'joint states' if of == 'joints' else of
         assert re.match(rf'[45]\d % of the {kind} were dropped: different values with ', words)
 
 

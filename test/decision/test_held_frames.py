@@ -1,0 +1,62 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Frames that the chain file holds in wrong places."""
+
+from dataclasses import replace
+
+import fits
+import numpy as np
+import pytest
+from fits import NOISE, SCARA, SIGMAS, UR10E
+
+from calib_ros import Problem, identify
+from calib_ros.apply.simulation import measure
+from calib_ros.decision.reasons import Rule
+from calib_ros.decision.steps import find_step
+from calib_ros.estimation import fitting
+from calib_ros.kinematics import se3
+
+pytestmark = pytest.mark.usefixtures('unsearched')
+
+
+def test_a_base_held_in_a_wrong_place_is_no_step(rng):
+    true = fits.arm(rng)
+    seen = measure(true, UR10E.random_joints(60, rng), rng, *NOISE)
+    held = true.base.matrix.copy()
+    held[:3, 3] += [0.003, 0.0, 0.004]
+    chain = replace(UR10E, base=replace(true.base, matrix=held, fixed=True))
+    result = identify(Problem(chain, seen, **SIGMAS))
+    assert result.refusals[0].rule is Rule.MISTAKE
+    assert 'the base held by the chain file is off by' in result.refusals[0]
+
+
+@pytest.mark.parametrize(('held', 'in_turn'), [((0, 1, 2, 3), False), ((1, 3), True)])
+def test_bases_of_sessions_held_in_wrong_places_are_no_drift(held, in_turn):
+    """One after another they follow slow waves: a correction 1 mm off was accepted."""
+    rng = np.random.default_rng(1)
+    true, q = fits.arm(rng), UR10E.random_joints(100, rng)
+    seen = measure(true, q.mean(axis=0) + 0.2 * (q - q.mean(axis=0)), rng, *NOISE)
+    which = np.arange(100) % 4 if in_turn else np.arange(100) // 25
+    sets = [replace(seen.select(which == k), base=f'base_{k}') for k in range(4)]
+    chain = replace(UR10E, base=None, tool=None)
+    for k in held:
+        wrong = true.base.matrix.copy()
+        wrong[:3, 3] += rng.normal(scale=3e-4, size=3)
+        chain = chain.with_frame(f'base_{k}', replace(true.base, matrix=wrong, fixed=True))
+    refused = identify(Problem(chain, sets[0], more=sets[1:], **SIGMAS)).refusals[0]
+    bases = ', '.join(f'base_{k}' for k in held)
+    assert refused.startswith(f'the {bases} held by the chain file are off by')
+
+
+def test_a_held_base_is_off_by_what_shows_not_along_what_the_tool_makes_up_for(rng):
+    """Axes of a SCARA are parallel but for errors: some mm were told as 440, mostly of height."""
+    first, elbow, quill, spindle = SCARA.joints
+    nominal = replace(SCARA, joints=(first, elbow, spindle, quill))
+    true = fits.arm(rng, chain=nominal)
+    seen = measure(true, nominal.random_joints(60, rng), rng, *NOISE)
+    held = true.base.matrix.copy()
+    held[:3, :3] @= se3.exp_rotation(np.array([[2e-3, -2e-3, 0.0]]))[0]
+    chain = replace(nominal, base=replace(true.base, matrix=held, fixed=True))
+    step = find_step(fitting.fit(Problem(chain, seen, **SIGMAS)))
+    assert step.held
+    assert step.size < 0.01
