@@ -228,16 +228,16 @@ class _Scan:
             if left <= STEP_TOLERANCE**2 * equations or freedom <= rank.max() + 1.0:
                 continue
             gains = (along**2).sum(axis=1)
-            k = int(np.argmax(gains))
+            # a step in some sets spares the others too: steps compete by the squares of all
+            rests = np.maximum(total - gains, 1e-12 * total)
+            criteria = count * np.log(rests / total) + rank * np.log(count)
+            k = int(np.argmin(criteria))
             gain, degrees = float(gains[k]), int(rank[k])
             share = 1.0 - max(1.0 - gain / left, 1e-12) * freedom / (freedom - degrees)
-            # a step in some sets spares the others too: steps compete by the squares of all
-            rest = max(total - gain, 1e-12 * total)
-            variance = rest / (free - degrees)
+            variance = float(rests[k]) / (free - degrees)
             by_chance = trials * chance_of(gain / variance, degrees, free - degrees)
-            criterion = count * np.log(rest / total) + degrees * np.log(count)
-            if share > least and by_chance < 1.0 - SURE and criterion < lowest:
-                lowest = criterion - HALF_THE_DIGITS * count  # of equals the first
+            if share > least and by_chance < 1.0 - SURE and criteria[k] < lowest:
+                lowest = criteria[k] - HALF_THE_DIGITS * count  # of equals the first
                 size = clear_size(root[k], along[k], lengths[k, columns])
                 found = _Found(group, int(places[k]), size, share, variance)
         return found

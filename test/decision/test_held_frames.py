@@ -60,3 +60,18 @@ def test_a_held_base_is_off_by_what_shows_not_along_what_the_tool_makes_up_for(r
     step = find_step(fitting.fit(Problem(chain, seen, **SIGMAS)))
     assert step.held
     assert step.size < 0.01
+
+
+def test_a_held_base_of_the_last_session_did_not_move_within_it():
+    """The tool makes up for two directions of its place: six of a move explain a little more."""
+    rng = np.random.default_rng(22)
+    true = fits.arm(rng, chain=SCARA)
+    seen = measure(true, SCARA.random_joints(72, rng), rng, *NOISE)
+    wrong = true.base.matrix.copy()
+    wrong[:3, 3] += [3e-4, 0.0, 4e-4]
+    held = replace(true.base, matrix=wrong, fixed=True)
+    chain = replace(SCARA, base=None, tool=None).with_frame('base_2', held)
+    sets = [replace(seen.select(np.arange(72) // 24 == k), base=f'base_{k}') for k in range(3)]
+    step = find_step(fitting.fit(Problem(chain, sets[0], more=sets[1:], **SIGMAS)))
+    assert step.held
+    assert step.what == 'base_2'
