@@ -7,13 +7,18 @@ With the wanted RMS error as limit, and the interval of `confidence.py`, it is
     PASS        the whole interval is within the limit
     FAIL        the whole interval is beyond it
     UNDECIDED   the limit lies in the interval: more poses are needed
+
+Of a device with more noise than that of the calibration, the excess is no error of the arm: it
+does not hold only if the interval without it is beyond the limit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
+
+import numpy as np
 
 from calib_ros.apply.confidence import limits_of, moments_of
 from calib_ros.decision import mistakes
@@ -63,6 +68,8 @@ class Judgement:
     """Share of the measurements that the calibration was fitted to (`Calibration.reused`)."""
     mistake: Diagnosis | None
     """What explains measurements that are further off than any arm."""
+    noise: float
+    """RMS [m] of the noise of a noisier device, beyond the former error; without a tolerance."""
 
     @property
     def failed(self) -> bool:
@@ -88,12 +95,14 @@ def judge(
     confidence: float = CONFIDENT,
     lost: int = 0,
     of_messages: bool = False,
+    sigma_position: float = Settings.sigma_position,
 ) -> Judgement:
     """Judge a calibrated arm by its errors at new measurements, in its frames if not given.
 
     Each configuration counts once, however often it was measured; fitted frames have absorbed the
     errors of `lost` ones. Without a `tolerance` [m] the limit is that of the calibration. Remedies
-    of a mistake are those of messages or of tables.
+    of a mistake are those of messages or of tables. `sigma_position` [m] is the noise of positions
+    without a covariance; the default is that of the earlier device.
     """
     found = found or along_base(compare(arm.before, arm.chain, sets), arm.chain, sets)
     moments = moments_of(found.after.position, found.before.configurations)
@@ -101,10 +110,12 @@ def judge(
     angle = 1e-3 * (found.figures[1].rms_mrad or 0.0)
     mistake = _mistake(arm, sets, rms, angle, of_messages)
     reused, limit = arm.reused(sets), tolerance or arm.limit(sets, found.figures[0].rms_mm)
+    noise = 0.0 if tolerance else _noise_beyond(arm, sets, sigma_position)
+    least = np.sqrt(np.maximum(lower**2 - noise, 0.0))
     verdict: Verdict = 'no verdict'
     if limit is not None and not mistake:
-        verdict = compared(limit, lower[0], upper[0])
-        decided = numbers[(upper <= limit) | (lower > limit)]
+        verdict = compared(limit, least[0], upper[0])
+        decided = numbers[(upper <= limit) | (least > limit)]
     if reused and verdict != 'FAIL':
         verdict = 'no verdict'
     return Judgement(
@@ -119,7 +130,22 @@ def judge(
         needed=None if verdict == 'no verdict' or not decided.size else int(decided[0]),
         reused=reused,
         mistake=mistake,
+        noise=float(np.sqrt(noise)),
     )
+
+
+def _noise_beyond(arm: Calibration, sets: Sequence[Observations], sigma: float) -> float:
+    """Return by how much the mean square noise [m^2] exceeds the former noise and error."""
+    if arm.noise is None or arm.residual is None or any(s.pixels is not None for s in sets):
+        return 0.0
+    problem = Problem(arm.before, sets[0], more=sets[1:])  # the earlier device
+    then, now = (
+        arm.noise.expected_in(each).sigma_position
+        for each in (problem, replace(problem, sigma_position=sigma))
+    )
+    found = np.concatenate([each.covariances((now, 1.0))[:, :3, :3] for each in sets])
+    former = max(3.0 * then**2, arm.residual**2)
+    return max(0.0, float(np.trace(found.mean(axis=0))) - former)
 
 
 def _mistake(

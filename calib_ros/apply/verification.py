@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib_ros.annotated import Confidence, InMetres, as_annotated
+from calib_ros.annotated import Confidence, InMetres, Positive, as_annotated
 from calib_ros.apply.both_arms import by_both_arms
 from calib_ros.apply.confidence import limits_of, moments_of
 from calib_ros.apply.iso_9283 import TILTED
@@ -25,6 +25,7 @@ from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
+from calib_ros.settings import Settings
 
 NEEDED = 1 + len(TILTED)  # configurations without those for fitted frames: as in ISO 9283
 
@@ -39,12 +40,14 @@ def verify(
     commanded: FloatArray | None = None,
     new_tool: bool = False,
     progress: Notify = quiet,
+    sigma_position: Positive = Settings.sigma_position,
 ) -> Verification:
     """Judge a calibrated arm on measurements that were not used for it.
 
     `sets` are new measurements of poses or positions, in the frames of the calibration. Without a
     `tolerance`, the largest acceptable RMS position error [m], the verdict is whether the
-    calibration holds, by `Calibration.limit`. `progress` receives the share done.
+    calibration holds, by `Calibration.limit`; `sigma_position` [m] is the noise of positions
+    without a covariance. `progress` receives the share done.
 
     With `new_base` the measuring devices were moved, with `new_tool` the targets replaced. Fitting
     a frame absorbs the errors of two configurations, or of one (on the flange: of one, or two).
@@ -64,7 +67,8 @@ def verify(
         were, more = 'pose was' if count == 1 else 'poses were', NEEDED + lost
         of_frames = f', {lost} of them for the refitted frames' if lost else ''
         raise InputError(f'{count} {were} measured; at least {more} are needed{of_frames}')
-    found = judge(arm, sets, comparison, tolerance, confidence, lost)
+    given = comparison, tolerance, confidence, lost
+    found = judge(arm, sets, *given, sigma_position=sigma_position)
     return Verification(
         **vars(found),
         tolerance=tolerance,

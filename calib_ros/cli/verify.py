@@ -61,8 +61,10 @@ def _verified(
     commanded = read_joints(options.commanded, nominal) if options.commanded else None
     tolerance = None if options.tolerance is None else 1e-3 * options.tolerance
     confidence, moved = options.confidence, (options.new_base, options.new_tool)
+    sigma = common.settings_of(options).sigma_position
     with screen.work('judging') as work:
-        found = verify(arm, sets, tolerance, confidence, moved[0], commanded, moved[1], work)
+        given = confidence, moved[0], commanded, moved[1], work, sigma
+        found = verify(arm, sets, tolerance, *given)
 
     def file() -> None:
         if filed is not None:

@@ -54,6 +54,10 @@ AT_THE_LIMIT = (
         'calibrate again with new poses, and try --model auto.',
     ),
 )
+NOISY = (
+    Headline('open', 'UNDECIDED: the device has too much noise to tell'),
+    ('Verify with a device as accurate as that of the calibration, or give a --tolerance.',),
+)
 REUSED = (
     Headline('open', 'No verdict: the calibration was computed from these measurements'),
     (f'Measure new poses, {SPREAD_OUT}, and verify with those alone.',),
@@ -76,7 +80,7 @@ def standing(found: Verification) -> tuple[Headline, tuple[str, ...]]:
         return REUSED
     state, steps = STANDINGS[found.verdict]
     if found.verdict == 'UNDECIDED' and found.needed is None and not found.outside:
-        state, steps = AT_THE_LIMIT
+        state, steps = NOISY if found.noise else AT_THE_LIMIT
     if not found.by_program:  # nor whether the correction reaches the arm
         state = replace(state, heading=state.heading.replace('the arm', 'the calibration'))
         steps = tuple(each for each in steps if each != ACTIVE)

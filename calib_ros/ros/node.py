@@ -315,7 +315,8 @@ class CalibrationNode(Batched):
         self, given: tuple[Calibration, list[Observations], Callable[..., str]]
     ) -> Answer:
         calibration, sets, filed = given
-        found = judge(calibration, sets, of_messages=True)
+        sigma = self.session.settings.sigma_position
+        found = judge(calibration, sets, of_messages=True, sigma_position=sigma)
         row = partial(verification_row, calibration.chain, found, kind='validate')
         text = words.verdict_in_words(found) + filed(row, table_hash(calibration.chain))
         return found.verdict == 'holds', text
