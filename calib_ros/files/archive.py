@@ -7,6 +7,7 @@ Rows that cannot be written, as on a full disk, wait in memory.
 
 from __future__ import annotations
 
+import os
 import re
 import stat
 from collections.abc import Callable, Mapping, Sequence
@@ -28,6 +29,7 @@ from calib_ros.errors import InputError, trouble
 from calib_ros.files.journal import (
     Journal,
     joints_line,
+    locked,
     read_journal,
     refuse_other_joints_than,
     settings_beside,
@@ -62,6 +64,7 @@ class Archive:
         self._joints = joints
         self._configuration = configuration
         self._journal: Journal | None = None
+        self._mark: int | None = None  # the file of a journal that has no poses yet
         self._waiting: list[tuple[Sample, bool]] = []
         self._written: list[tuple[Sample, bool]] = []  # to the journal that is open
         self._due = False
@@ -91,11 +94,19 @@ class Archive:
         """Return the path of the journal, if any."""
         return None if self._journal is None else self._journal.path
 
-    def begin(self) -> Path | None:
-        """Show that a session begins, so that the journal before, returned, is not resumed."""
+    def begin(self) -> str:
+        """Show that a session begins, so that the journal before is not resumed; tell of that."""
         with suppress(OSError):  # told with the first pose
-            self.path.touch()
-        return self.newest_journal()
+            self._mark = locked(self.path)
+        if (earlier := self.newest_journal()) is None:
+            return ''
+        try:
+            os.close(locked(earlier, create=0))
+        except InputError as err:
+            return str(err)
+        except OSError:  # told when it is read
+            pass
+        return f'a new session begins: to continue {earlier}, start with resume:=true'
 
     def add(self, sample: Sample) -> None:
         """Keep a sample."""
@@ -136,6 +147,7 @@ class Archive:
         if self._written:
             whole = whole_journal(self._written, len(self._joints))
             write_file(self.path, whole, overwrite=True)
+        self._unmark()
         before, self._journal = self._journal, Journal(self.path, len(self._joints))
         if before is not None:
             before.close()
@@ -164,6 +176,8 @@ class Archive:
             return (), (f'nothing to resume in {self.folder}: a new session begins',)
         last = self._files(_JOURNAL, 0)[-1]
         if last != newest:
+            with suppress(OSError):  # told with the first pose
+                self._mark = locked(last)
             self.path = last
             told = f'the last session had no poses: to continue {newest} instead, delete {last}'
             return (), (told,)
@@ -233,7 +247,13 @@ class Archive:
         elif not words and self.path in {*self._files(_JOURNAL, 0)} - {*self._files(_JOURNAL)}:
             with suppress(OSError):
                 self.path.unlink()  # as `begin` made it
+        self._unmark()
         return words
+
+    def _unmark(self) -> None:
+        if self._mark is not None:
+            os.close(self._mark)
+        self._mark = None
 
     def _new_path(self, ending: str) -> Path:
         """Return a path that sorts behind all others, even if the clock was set back."""

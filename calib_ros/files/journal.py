@@ -37,16 +37,34 @@ from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, t
 ITS_JOINTS = '# joints: '  # what the settings beside a journal begin with
 
 
+def locked(path: Path, create: int = os.O_CREAT) -> int:
+    """Return an open file that no other process can lock until it is closed.
+
+    Raises InputError if another process has locked it, OSError if it cannot be opened.
+    """
+    file = os.open(path, os.O_RDWR | os.O_APPEND | create, 0o644)
+    try:  # held until the file is closed or the process ends
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(file)
+        raise InputError(
+            f'another process writes {path}: stop it, or give each robot its own serial or '
+            'data_dir'
+        ) from None
+    except OSError:  # a file system without locks
+        pass
+    return file
+
+
 class Journal:
     """An open journal, which only grows and which no other process can open."""
 
     def __init__(self, path: Path, joints: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path, self._size = path, 0
-        self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
+        self._file = locked(path)
         with ExitStack() as stack:
             stack.callback(self.close)
-            self._lock()
             self._begin(columns(joints))
             self._size = os.fstat(self._file).st_size
             stack.pop_all()
@@ -68,16 +86,6 @@ class Journal:
     def close(self) -> None:
         """Close the file."""
         os.close(self._file)
-
-    def _lock(self) -> None:
-        try:  # held until the file is closed or the process ends
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                f'another process writes {self.path}: give each robot its own serial or data_dir'
-            ) from None
-        except OSError:  # a file system without locks
-            pass
 
     def _begin(self, header: Sequence[str]) -> None:
         """Write the header of a new file; remove a row cut off by a crash."""

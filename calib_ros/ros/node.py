@@ -98,8 +98,7 @@ class CalibrationNode(Batched):
         """Samples not kept in data_dir at the end, and why; empty if all were."""
         if given.resume:
             self._resume()
-        elif earlier := self._archive.begin():
-            words = f'a new session begins: to continue {earlier}, start with resume:=true'
+        elif words := self._archive.begin():
             self.get_logger().info(words)
         self._inputs = Inputs(self, self._streams())
         refuse_unknown_names(self, names)

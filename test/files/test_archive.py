@@ -165,15 +165,17 @@ def test_nothing_to_resume(tmp_path):
     samples, (warning,) = archive.resume()
     assert (samples, 'nothing to resume' in warning) == ((), True)
     archive.folder.rmdir()  # as a full disk, no end of the node
-    assert archive.begin() is None
+    assert archive.begin() == ''
 
 
 def test_a_session_without_poses_that_was_killed_is_resumed_and_not_the_one_before(tmp_path):
     """The poses of yesterday became those of a node that respawned before its first one."""
     written(tmp_path, 1)
-    open_archive(tmp_path).begin()
+    again = open_archive(tmp_path)
+    assert again.begin().endswith('Z.csv, start with resume:=true')
     (journal, mark) = sorted(tmp_path.glob('*.csv'))
     for how in ('killed', 'ended'):
+        again._unmark()  # as the end of its process does
         again = open_archive(tmp_path)
         samples, (warning,) = again.resume()
         assert (samples, again.start_new()) == ((), None)
@@ -184,6 +186,19 @@ def test_a_session_without_poses_that_was_killed_is_resumed_and_not_the_one_befo
     again.begin()
     again.add(sample(2))
     assert stamps(tmp_path) == [2]
+
+
+def test_a_second_node_is_told_of_the_one_that_runs_and_not_to_delete_its_journal(tmp_path):
+    """Before the first pose it was "to continue yesterday's instead, delete" that of the first."""
+    written(tmp_path, 1)
+    first, second, said = open_archive(tmp_path), open_archive(tmp_path), 'another process writes'
+    first.begin()
+    with pytest.raises(InputError, match=f'{said} {first.path}: stop it, or give each robot'):
+        second.resume()
+    first.add(sample(2))
+    assert second.begin().startswith(f'{said} {first.path}: ')  # not "start with resume"
+    first.close()
+    assert 'to continue' in open_archive(tmp_path).begin()
 
 
 def test_a_journal_from_which_all_was_taken_back_is_resumed(tmp_path):
@@ -341,7 +356,7 @@ def test_poses_of_two_nodes_that_would_write_one_journal_are_kept(tmp_path, monk
         archive.add(sample(1))
         archive.add(sample(2))
     assert not first.error
-    assert second.error.startswith(f'another process writes {first.journal}: give each robot')
+    assert second.error.startswith(f'another process writes {first.journal}: stop it')
     with pytest.raises(InputError, match='in memory only and would be lost'):
         second.start_new()
     monkeypatch.setattr(tempfile, 'tempdir', str(elsewhere))

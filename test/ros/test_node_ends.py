@@ -126,7 +126,8 @@ def test_a_session_that_could_go_on_is_told_of(journal):
         said = f'to continue {path}, start with resume:=true'
         cell.spin_until(lambda: any(said in each.msg for each in told))
         assert node.session.samples == []
-        again = cell.start(chain='ur10e', data_dir=str(journal), resume=True)  # as if killed
+        node._archive._unmark()  # as if killed
+        again = cell.start(chain='ur10e', data_dir=str(journal), resume=True)
         said = f'the last session had no poses: to continue {path} instead, delete {journal}'
         cell.spin_until(lambda: any(said in each.msg for each in told))
         assert again.session.samples == []
