@@ -68,7 +68,9 @@ class LinearModel:
         rows = self._rows(self._names)
         self._ends = np.cumsum([each[-1].size for each in rows])
         owner = row_samples(rows)
-        self._folds = np.array([self._groups % problem.folds, blocks[self._groups]])[:, owner]
+        folds = np.array([self._groups % problem.folds, blocks[self._groups]])[:, owner]
+        self._order = np.lexsort(folds)  # of all rows: those of the same folds together
+        self._folds = folds[:, self._order]
         *columns, residual = stacked(rows).T
         self._columns = np.zeros((0, len(owner)))
         self._products = [np.zeros((1 + int(each.max(initial=0)), 0, 0)) for each in self._folds]
@@ -109,13 +111,15 @@ class LinearModel:
     def judge(self, chosen: Sequence[str], added: Sequence[str], what: str) -> GroupVerdict:
         """Compare held-out errors with and without `added` effects."""
         new = [name for name in added if name not in chosen]
-        found, pays = [], True
+        found = list[float]()
         for dealing in range(len(self._folds)):
             before = self._held_out_errors(dealing, chosen)
             after = self._held_out_errors(dealing, [*chosen, *new])
             gain, limit = log_gain(before, after, self._groups, SURE)
-            pays = pays and gain > max(limit, COUNTS)
+            pays = gain > max(limit, COUNTS)
             found += [1e3 * float(np.sqrt((e**2).sum(axis=1).mean())) for e in (before, after)]
+            if not pays:
+                break
         if pays and self._shifts is not None:
             pays = chance(self._shares(chosen, [new])[0]) < 1.0 - CERTAIN
         return GroupVerdict(what, found[0], found[1], bool(pays))
@@ -191,13 +195,13 @@ class LinearModel:
     def _add(self, columns: FloatArray) -> None:
         """Add columns (K, R) and their products with all, by fold of each dealing."""
         count = len(self._columns)
-        self._columns = np.concatenate([self._columns, columns])
+        self._columns = np.concatenate([self._columns, columns[:, self._order]])
         grown = (0, 0), (0, len(columns)), (0, len(columns))
         self._products = [np.pad(each, grown) for each in self._products]
-        for cell in np.unique(self._folds, axis=1).T:
-            part = self._columns[:, (self._folds == cell[:, np.newaxis]).all(axis=0)]
+        begins = np.flatnonzero(np.diff(self._folds, prepend=-1).any(axis=0))
+        for first, part in zip(begins, np.split(self._columns, begins[1:], axis=1), strict=True):
             found = np.hstack([part[count:] @ part[:count].T, gram(part[count:])])
-            for products, fold in zip(self._products, cell, strict=True):
+            for products, fold in zip(self._products, self._folds[:, first], strict=True):
                 products[fold, count:] += found
         for products in self._products:
             products[:, :count, count:] = np.swapaxes(products[:, count:, :count], 1, 2)
@@ -230,7 +234,8 @@ class LinearModel:
             factor = linalg.cho_factor(scaled)
             weights[fold, which] = -scale * linalg.cho_solve(factor, scale * left[:, 0])
         fold_of = self._folds[[dealing]]
-        left_out = np.take_along_axis(weights @ self._columns, fold_of, axis=0)[0]
+        left_out = np.empty(len(self._order))
+        left_out[self._order] = np.take_along_axis(weights @ self._columns, fold_of, axis=0)[0]
         pieces = np.split(left_out, self._ends[:-1])
         sets = self._system.sets
         errors = [s.position_errors(p) for s, p in zip(sets, pieces, strict=True)]

@@ -142,7 +142,9 @@ def test_verdicts_are_of_the_errors_left_out(model, monkeypatch):
     assert pays
     monkeypatch.setattr(linear, '_shifts', None)  # nor is anything shifted at sockets
     assert linear.judge([], FIRST, 'waves').pays
+    linear._errors.clear()
     assert not linear.judge([], SECOND, 'coupling').pays
+    assert {dealing for dealing, *_ in linear._errors} == {0}  # one dealing is enough to refuse
 
 
 def test_effects_that_depend_on_others_are_not_useful(model):
