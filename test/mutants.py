@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Tell which changes of numeric modules no near test notices, one change at a time.
+
+mutmut makes the changes (mutants) and runs the tests. This chooses both: a random sample of the
+mutants of some modules, and for each module only the tests near it.
+"""
+
+import argparse
+import ast
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from fnmatch import fnmatch
+from itertools import groupby
+from multiprocessing import Process
+from pathlib import Path
+
+from mutmut.__main__ import _run, collect_source_file_mutation_data, copy_src_dir, create_mutants
+from mutmut.configuration import config
+from mutmut.stats import status_by_exit_code
+
+CHANGED = ('git', 'diff', '--name-only', '--diff-filter=d', 'HEAD~1', '--', 'calib_ros')
+NONE = (
+    'No numeric module is given, or was changed by the last commit and since: give modules or '
+    'folders like calib_ros/kinematics, or names of mutants'
+)
+
+
+def modules_of(part):
+    """Return the numeric modules of a file, a folder or a pattern of names of mutants."""
+    path = Path(part)
+    if not path.exists():
+        path = Path(re.sub(r'\.x[_ǁ].*', '', part).replace('.', '/') + '.py')
+    found = sorted(path.glob('*.py')) if path.is_dir() else [path]
+    return [str(path) for path in found if path.exists() and config().should_mutate(path)]
+
+
+def imported(path):
+    """Return the modules and names that a file imports from."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom):
+            found |= {node.module, *(f'{node.module}.{each.name}' for each in node.names)}
+    return found
+
+
+def near(module):
+    """Yield the tests that import a module of their folder, then its importers, ... until all."""
+    tests = {path: imported(path) for path in Path('test', module.parts[1]).glob('test_*.py')}
+    users = {path: imported(path) for path in module.parent.glob('*.py')}
+    ring = {module}
+    while ring:
+        names = {'.'.join(path.with_suffix('').parts) for path in ring}
+        files = {f'test_{path.stem}.py' for path in ring}
+        found = {path for path, each in tests.items() if each & names or path.name in files}
+        if found:
+            yield sorted(map(str, found))
+        tests = {path: each for path, each in tests.items() if path not in found}
+        users = {path: each for path, each in users.items() if path not in ring}
+        ring = {path for path, each in users.items() if each & names}
+    if tests:
+        yield sorted(map(str, tests))
+
+
+def chosen(parts, count, seed, jobs):
+    """Write the mutants of `parts`; return the module and name of each of a random sample."""
+    modules = sorted({module for part in parts for module in modules_of(part)})
+    if not modules:
+        sys.exit(NONE)
+    config().only_mutate = modules
+    shutil.rmtree('mutants', ignore_errors=True)
+    copy_src_dir()
+    create_mutants(jobs)
+    written, _ = collect_source_file_mutation_data(mutant_names=())
+    every = [(Path(data.path), name) for data, name, _ in written]
+    named = [pair for pair in every if any(fnmatch(pair[1], part) for part in parts)] or every
+    print(f'{min(count, len(named))} of {len(named)} mutants:', *modules, flush=True)
+    return sorted(random.Random(seed).sample(named, min(count, len(named))))
+
+
+def tried(module, names, jobs):
+    """Run the tests near a module on its mutants; return the state of each by name.
+
+    Those further away run only on mutants of functions that none of those before calls.
+    """
+    left, states = names, {}
+    for tests in near(module):
+        Path('mutants/mutmut-stats.json').unlink(missing_ok=True)
+        config().pytest_add_cli_args_test_selection = tests
+        run = Process(target=_run, args=(left, jobs))  # of its own: modules are imported once
+        run.start()
+        run.join()
+        ended, _ = collect_source_file_mutation_data(mutant_names=left)
+        states |= {name: status_by_exit_code[code] for _, name, code in ended}
+        left = [name for name in left if states[name] in ('no tests', 'not checked')]
+        if not left:
+            break
+    return states
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
+    parser.add_argument('parts', nargs='*', help='modules, folders or names of mutants')
+    parser.add_argument('--count', type=int, default=40, help='mutants to try (default: 40)')
+    parser.add_argument('--seed', type=int, default=0, help='of the random choice (default: 0)')
+    parser.add_argument('--jobs', type=int, default=os.cpu_count())
+    given = parser.parse_args()
+    parts = given.parts or subprocess.check_output(CHANGED, text=True).split()
+    pairs = chosen(parts, given.count, given.seed, given.jobs)
+    states = {}
+    for module, group in groupby(pairs, key=lambda pair: pair[0]):
+        states |= tried(module, [name for _, name in group], given.jobs)
+    print(*(f'{name}: {state}' for name, state in states.items() if state != 'killed'), sep='\n')
+    counts = Counter(states.values())
+    noticed = counts['killed'] + counts['timeout']
+    print(', '.join(f'{count} {state}' for state, count in counts.most_common()))
+    print(f'{noticed} of {len(states)} noticed ({noticed / len(states):.0%}), seed {given.seed}.')
+    print(f'To see one: {Path(sys.executable).with_name("mutmut")} show NAME')
+
+
+if __name__ == '__main__':
+    main()
