@@ -40,6 +40,11 @@ def test_expected_errors_add_up(cell, arm):
     np.testing.assert_allclose(arm.expected(q, 'corrected') ** 2, variance + rms**2, rtol=1e-9)
     both = variance + rms**2 + arm.removed(q)[0] ** 2
     np.testing.assert_allclose(arm.expected(q, 'nominal') ** 2, both, rtol=1e-9)
+    alone = replace(arm, region=None, covariance=None)
+    both = arm.residual**2 + arm.removed(q)[0] ** 2
+    np.testing.assert_allclose(alone.expected(q, 'nominal') ** 2, both, rtol=1e-9)
+    with pytest.raises(ConfigError, match='a chain alone does not predict the error'):
+        alone.expected(q, 'corrected')
     with pytest.raises(UnknownNameError, match='model "best"'):
         arm.expected(q, 'best')
 

@@ -145,7 +145,7 @@ def test_defaults_and_numbers_without_a_dot():
 
 
 BASE = UR + 'base: {xyz: [0, 0, 0], quat_xyzw: [0, 0, 0, 1]}\nframes: {tool_1: null}\n'
-MANY = (f'\n- {{name: j{k}, a: 0, alpha: 0, d: 0, theta: 0}}' for k in range(45))
+MANY = [f'\n- {{name: j{k}, a: 0, alpha: 0, d: 0, theta: 0}}' for k in range(45)]
 WRONG = [
     ('alpha:', 'alpha: 0.0, alpha:', 'key "alpha" appears twice'),
     ('theta: 0.0', 'theat: 0.0', 'joint 1: unknown key "theat": did you mean "theta"'),
@@ -210,6 +210,10 @@ def test_a_wrong_chain_file_is_refused_with_the_place(right, wrong, complaint):
     assert 'cell.yaml' in str(caught.value)
 
 
+def test_as_many_joints_as_may_be_are_read():
+    assert len(parse_chain(BASE.replace('joints:', f'joints:{"".join(MANY[1:])}')).joints) == 50
+
+
 OF_3, OF_NONE = (f'convention: standard\njoints: {rows}\n' for rows in ('3', '[]'))
 
 
@@ -256,6 +260,8 @@ def test_every_shipped_robot_is_read(tmp_path, monkeypatch):
         assert chain.name == name
         assert all(joint.lower < joint.upper for joint in chain.joints)
         assert_same(parse_chain(dump_chain(chain)), chain)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    assert shipped_robots().keys() == {'ur10e'}  # those of a workspace come first
 
 
 def test_an_unknown_robot_lists_those_there_are():

@@ -93,6 +93,8 @@ def test_limits_hold_and_full_turns_are_taken_back():
     np.testing.assert_allclose(round_.joints, [[-3.0], [3.0]])  # 3.28 is beyond the limit
     turned = solve(chain, wanted, np.array([[1.8 + 2.0 * np.pi, 0.1], [0.9 - 2.0 * np.pi, 0.2]]))
     np.testing.assert_allclose(turned.joints, [[1.9, 0.2], [1.0, 0.1]], atol=1e-8)
+    whole_numbers = solve(chain, wanted, np.array([[1, 0], [1, 0]]))
+    np.testing.assert_allclose(whole_numbers.joints, [[1.9, 0.2], [1.0, 0.1]], atol=1e-8)
 
 
 def test_each_pose_is_solved_as_if_alone(rng):

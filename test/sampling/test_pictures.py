@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from calib_ros.files.images import grey
+from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling import pictures
 from calib_ros.sampling.board_finder import Flaw
-from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.sample import Sample, View
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import Part
 from calib_ros.sampling.source_texts import parse_sources
@@ -54,6 +56,59 @@ def test_why_an_image_is_not_looked_at_is_told():
     }
 
 
+LENS = Lens(1000.0, 1000.0, 320.0, 240.0)
+BOARD = np.array([[0.03 * column, 0.03 * row, 0.0] for row in range(3) for column in range(4)])
+
+
+class Seeing:
+    """A detector that sees some corners of a board, or takes no image at all."""
+
+    def __init__(self, count):
+        place = BOARD @ se3.exp_rotation(np.array([0.3, -0.2, 0.1])).T + [0.02, -0.03, 0.5]
+        pixels = place[:, :2] / place[:, 2:] * 1000.0 + [320.0, 240.0]
+        self.view = View(BOARD[:count], pixels[:count], LENS)
+
+    def look(self, message):
+        if message is None:
+            raise ValueError('no image')
+        return self.view
+
+
+@pytest.mark.parametrize(
+    ('message', 'cause', 'reason'),
+    [
+        ('three corners', 'that tells no pose of the board', 'no image shows 4 board points'),
+        (None, 'that cannot be decoded', "it cannot be decoded: ValueError('no image')"),
+    ],
+)
+def test_an_image_that_tells_nothing_is_counted_with_its_cause(message, cause, reason):
+    kept = pictures.Pictures(lambda: 0.3)
+    kept.cameras = {'image': Seeing(3)}
+    number = kept.keep('image', 1, lambda: message)
+    assert kept.through([Sample(0, np.zeros(2), images=(number,))], wait=True) == []
+    assert kept.reason.startswith(reason)
+    assert kept.dropped == {f'measurements: image {cause}': 1}
+
+
+def test_an_image_tells_the_pose_of_the_board_and_how_well():
+    found = {}
+    for sigma in (0.3, 0.6):
+        kept = pictures.Pictures(lambda sigma=sigma: sigma)
+        kept.cameras = {'image': Seeing(12)}
+        numbers = tuple(kept.keep('image', 1, lambda: 'board') for _ in range(3))
+        (found[sigma],) = kept.through([Sample(7, np.ones(2), images=numbers)], wait=True)
+    fine, coarse = found.values()
+    np.testing.assert_allclose(fine.position, [0.02, -0.03, 0.5], atol=1e-9)
+    turn = se3.log_rotation(fine.rotation[np.newaxis])[0]
+    np.testing.assert_allclose(turn, [0.3, -0.2, 0.1], atol=1e-9)
+    np.testing.assert_allclose(coarse.covariance, 4.0 * fine.covariance)
+    across, along = np.sqrt(np.diag(fine.covariance)[[0, 2]])
+    assert 1.0 < across / (0.3 / 1000.0 * 0.5 / np.sqrt(12)) < 3.0  # turns look like shifts
+    assert along > 2.0 * across  # a small board tells less of its distance
+    assert (fine.stamp_ns, fine.images) == (7, ())
+    np.testing.assert_array_equal(fine.view.pixels, Seeing(12).view.pixels)
+
+
 def test_memory_for_images_is_bounded(monkeypatch):
     monkeypatch.setattr(pictures, 'MOST_BYTES', 1000)
     kept = pictures.Pictures(lambda: 0.3)
@@ -61,7 +116,7 @@ def test_memory_for_images_is_bounded(monkeypatch):
         newest = kept.keep('image', 100, lambda: None)
     assert newest in kept._kept
     assert 4 < len(kept._kept) <= 10
-    assert np.diff(list(kept._kept)).max() < 40  # old ones are among them
+    assert np.diff([0, *kept._kept]).max() < 40  # old ones are among them
 
 
 def test_the_first_image_after_a_pause_is_kept_until_its_clock_is_known():
