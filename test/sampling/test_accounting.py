@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every measurement that came is in a sample, waits, or is counted with a cause: none is lost."""
 
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -23,9 +24,10 @@ from streams import (
     transform,
 )
 
+from calib_ros.decision.reasons import Rule
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.sampling.account import Cause, lost
+from calib_ros.sampling.account import Account, Cause, Lost, lost, too_much_lost
 from calib_ros.sampling.batches import decode
 from calib_ros.sampling.frame_names import FrameNames
 from calib_ros.sampling.joint_names import JointNames
@@ -175,6 +177,49 @@ def test_every_measurement_is_accounted_for(plan, traffic):
 def test_the_name_of_a_frame_makes_no_loss():
     cause = Cause('measurements', 'in frame "stamping press", not in frame_id "memory"')
     assert lost('measurements', 100, {cause: 50})[0] == 0.0
+
+
+ALLOWED = 'accept the rest with largest_loss (--largest-loss) 0.36'
+LATE, EMPTY = Cause(POSES, Lost('stamp too late')), Cause(POSES, 'empty')
+COUNTED = Account(
+    joint_states=900,
+    poses=30,
+    waiting=4,
+    samples=12,
+    held_out=3,
+    configurations=11,
+    unused={Cause(POSES, 'the arm was moving'): 7},
+    dropped={LATE: 2, Cause(POSES, Lost('zero stamp')): 5, EMPTY: 9},
+    notes={'two publishers': 1},
+    foreign_names=(),
+    never_named=(),
+)
+
+
+def test_an_account_tells_every_count():
+    assert str(COUNTED) == (
+        '900 joint states and 30 measurements gave 12 poses to fit and 3 held out, 11 of them '
+        'different, 4 measurements waiting; not used: 7 x measurements: the arm was moving; '
+        'dropped: 2 x measurements: stamp too late, 5 x measurements: zero stamp, '
+        '9 x measurements: empty; note: 1 x two publishers'
+    )
+    plain = replace(COUNTED, held_out=0, configurations=12, waiting=0, unused={}, dropped={})
+    assert str(replace(plain, notes={})) == '900 joint states and 30 measurements gave 12 poses'
+    another = replace(plain, foreign_names=('j1', 'j2'), never_named=('a', 'b'))
+    assert str(another) == (
+        '900 joint states and 30 measurements gave 12 poses; joint states never name a, b, but '
+        'j1, j2: give the chain of this arm (--chain) or, if only the names differ, set '
+        'joint_names (--joint-names)'
+    )
+
+
+def test_the_largest_of_the_causes_of_a_loss_is_told():
+    share, text = lost(POSES, 20, COUNTED.dropped)
+    assert share == 7 / 20
+    assert text == '35 % of the measurements were dropped: zero stamp'
+    (reason,) = too_much_lost(replace(COUNTED, poses=20), 0.34)
+    assert (reason.rule, str(reason)) == (Rule.DROPPED, f'{text}; remove the cause, or {ALLOWED}')
+    assert too_much_lost(replace(COUNTED, poses=20), 0.35) == []
 
 
 @pytest.mark.parametrize('full', [0, 1])
