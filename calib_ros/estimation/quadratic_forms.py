@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -20,14 +20,27 @@ _Part: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 class QuadraticForms:
-    """Quadratic forms of residuals, and their moments."""
+    """Quadratic forms of residuals, and their moments.
 
-    def __init__(self, units: Stops, extra: FloatArray) -> None:
+    Columns with equal priors may be combined at will. Combinations of those `alike` that hardly
+    anything but their prior tells are left out: waves of a joint that turns little are many.
+    """
+
+    def __init__(
+        self, units: Stops, extra: FloatArray, alike: Sequence[Sequence[int]] = ()
+    ) -> None:
         self._units = units
         width = extra.shape[1]
         rows = [part.reshape(width + 1, -1).T for part in units.parts]
         stacked = np.concatenate([*rows, np.pad(extra, ((0, 0), (0, 1)))])
-        basis = linalg.qr(stacked[:, :-1], mode='economic', check_finite=False)[0]
+        untold, rest = list[int](), len(stacked) - len(extra)
+        for own in alike:
+            sizes, turned = linalg.eigh(gram(stacked[:rest, own].T))
+            stacked[:, own] = stacked[:, own] @ turned
+            told = HALF_THE_DIGITS * float(extra[:, own[0]] @ extra[:, own[0]])
+            untold += own[: int(np.searchsorted(sizes, told))]
+        basis = np.delete(stacked[:, :-1], untold, axis=1)
+        basis = linalg.qr(basis, mode='economic', overwrite_a=True, check_finite=False)[0]
         left = stacked[:, -1] - basis @ (basis.T @ stacked[:, -1])
         self.parts: dict[int, _Part] = {}
         first = 0

@@ -36,6 +36,7 @@ from calib_ros.estimation.quadratic_forms import QuadraticForms
 from calib_ros.estimation.stops import MOST_STOPS, gather, gathered
 from calib_ros.estimation.system import System
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 
 DECAYS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
@@ -65,7 +66,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     if len(few) < TELLING:
         return Shared(**correlations, found=(), middles={})
     extra, _ = system.extra_rows(fit.chain, names)
-    forms = QuadraticForms(few, extra)
+    forms = QuadraticForms(few, extra, _alike(fit.chain, names, extra))
     limit = special.ndtri(1.0 - (1.0 - CERTAIN) / (len(kinds) * len(forms.parts)))
     alike: dict[int, list[str]] = {}
     for kind in kinds:
@@ -100,6 +101,15 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
         middles[part] += middle
     found = tuple(kind for kind in kinds if any(kind in each for each in alike.values()))
     return Shared(**correlations, found=found, middles=middles)
+
+
+def _alike(chain: Chain, names: Sequence[str], extra: FloatArray) -> list[list[int]]:
+    """Return the columns of the effects of one joint with one prior, by the rows (R, P) of all."""
+    effects, found = {name for name, _ in chain.effects}, dict[tuple[str, float], list[int]]()
+    for k, (name, column) in enumerate(zip(names, extra.T, strict=True)):
+        if name in effects and column.any():
+            found.setdefault((Parameter(name).owner, float(column.max())), []).append(k)
+    return [*found.values()]
 
 
 def squares_of(chain: Chain, system: System) -> FloatArray:

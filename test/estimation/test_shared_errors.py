@@ -307,6 +307,34 @@ def test_sizes_are_those_that_make_the_forms_as_large_as_they_are(width, monkeyp
     np.testing.assert_allclose(moments, traces, rtol=1e-9)
 
 
+def test_effects_that_only_their_prior_tells_take_nothing():
+    """Waves of a joint that turns little are alike: combinations of them are left out."""
+    rng = np.random.default_rng(5)
+    units, waves = drawn(rng, width=9), rng.normal(size=(6, 2))
+    for part in units.parts:
+        part[2:8] = np.tensordot(waves, part[2:4].copy(), 1)
+    extra = np.diag([0.0, 0.0, *6 * [0.7], 0.0])
+    plain, fewer = (
+        quadratic_forms.QuadraticForms(units, extra, alike) for alike in ((), [[*range(2, 8)]])
+    )
+    assert [forms.parts[0][0].shape[2] for forms in (plain, fewer)] == [9, 5]
+    kernels = {0: [('successive', 5.0), ('near', 0.5)], 1: [('near', 0.5)]}
+    for part in (0, 1):
+        links = units.links('near')
+        np.testing.assert_allclose(fewer.test(part, links), plain.test(part, links), rtol=1e-9)
+        found, expected = (forms.sizes(kernels)[part] for forms in (fewer, plain))
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_effects_of_one_joint_with_one_prior_may_be_combined():
+    waves = ('elbow_joint.sin_3', 'elbow_joint.cos_3', 'wrist_1_joint.sin_3', 'elbow_joint.sin_1')
+    chain = UR10E.with_effects(waves)
+    names = ('elbow_joint.a', *waves, 'base.x')
+    extra = np.diag([2.0, 5.0, 5.0, 5.0, 3.0, 0.0])
+    assert shared_errors._alike(chain, names, extra) == [[1, 2], [3], [4]]
+    assert not shared_errors._alike(chain, names, extra[:0])
+
+
 def test_where_nothing_is_left_nothing_is_shared():
     units = drawn(np.random.default_rng(6))
     for part in units.parts:
