@@ -16,10 +16,11 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 class Moving:
     """Columns switched on together: frames of some sets, zeros of joints, or the load.
 
-    A frame among them may be `held`: then from the first pose on.
+    `owners` are the frames or joints by name. A frame among them may be `held`: then from the
+    first pose on.
     """
 
-    what: str
+    owners: tuple[str, ...]
     kind: str
     names: tuple[str, ...]
     sets: tuple[int, ...]
@@ -32,8 +33,8 @@ def of_the_arm(problem: Problem) -> list[Moving]:
     last = joints[-1].name
     load = tuple(Parameter(j.name, f'gravity_{last}') for j in joints if j.type == 'revolute')
     zeros = tuple(joint.driven for joint in joints)
-    loads = [Moving('the load', 'load', load, everywhere)] if load else []
-    return [*loads, Moving('all joints', 'joints', zeros, everywhere)]
+    loads = [Moving(('the load',), 'load', load, everywhere)] if load else []
+    return [*loads, Moving(('all joints',), 'joints', zeros, everywhere)]
 
 
 def groups_of(problem: Problem) -> list[Moving]:
@@ -45,16 +46,17 @@ def groups_of(problem: Problem) -> list[Moving]:
             seen = problem.sets[sets[0]]
             socket = kind == 'base' and (seen.socket or seen.seen)  # the ball turns in it
             names = parameters_of(frame)[: 3 if socket else 6]
-            found.append(Moving(frame, kind, names, tuple(sets), problem.model.frame(frame).fixed))
+            held = problem.model.frame(frame).fixed
+            found.append(Moving((frame,), kind, names, tuple(sets), held))
         if kind == 'base' and len(found) > 1:  # the robot's foot
             found.append(_together(found))
     joints, everywhere = problem.chain.joints, tuple(range(len(problem.sets)))
-    found += [Moving(each.name, 'joint', (each.driven,), everywhere) for each in joints]
+    found += [Moving((each.name,), 'joint', (each.driven,), everywhere) for each in joints]
     wires: dict[str, list[int]] = {}
     for k, each in enumerate(problem.sets):
         if each.of_wire:
             wires.setdefault(each.base, []).append(k)
-    found += [Moving(w, ZERO, (Parameter(w, ZERO),), tuple(sets)) for w, sets in wires.items()]
+    found += [Moving((w,), ZERO, (Parameter(w, ZERO),), tuple(sets)) for w, sets in wires.items()]
     if len(wires) > 1:
         found.append(_together(found[-len(wires) :]))
     return found
@@ -64,4 +66,5 @@ def _together(groups: Sequence[Moving]) -> Moving:
     names = tuple(name for each in groups for name in each.names)
     sets = tuple(number for each in groups for number in each.sets)
     held = any(each.held for each in groups)
-    return Moving(', '.join(each.what for each in groups), groups[0].kind, names, sets, held)
+    owners = tuple(owner for each in groups for owner in each.owners)
+    return Moving(owners, groups[0].kind, names, sets, held)

@@ -17,6 +17,8 @@ FRAMES = ('base', 'tool')
 IN_THE_CELL = (*FRAMES, ZERO)  # beside the arm
 ZEROS = ('joint', ZERO)
 FROM_THERE, BEFORE_THAT = 'from there on', 'before that'
+RELEASE = 'correct it, or remove fixed: true there'
+"""What to do with a frame that the chain file holds in a wrong place."""
 OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
 
 
@@ -24,17 +26,17 @@ OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joi
 class Step:
     """What moved, when and by how much.
 
-    A base or tool frame, the zero of distances, a joint, all joints or the load (`kind`: 'base',
-    'tool', 'zero', 'joint', 'joints' or 'load'); `thing` names the device or target there. `set`,
-    `sample` and `stamp_ns` belong to the first sample after the step, which a reader finds at
-    `where`. `size` is the RMS change of positions ('m') or, if that weighs more, orientations
-    ('rad'); of a zero its own. `share` is its share of the squared residuals beyond that of as
-    many useless parameters. If all measurements on one side are outliers, `unused` says which: the
-    fit of frames is not affected. If the arm's places before and after lie `apart`, its errors may
-    look like a step of that size.
+    Base or tool frames, the zeros of distances, a joint, all joints or the load (`kind`: 'base',
+    'tool', 'zero', 'joint', 'joints' or 'load'), of these `owners`; `thing` names the device or
+    target there. `set`, `sample` and `stamp_ns` belong to the first sample after the step, which a
+    reader finds at `where`. `size` is the RMS change of positions ('m') or, if that weighs more,
+    orientations ('rad'); of a zero its own. `share` is its share of the squared residuals beyond
+    that of as many useless parameters. If all measurements on one side are outliers, `unused` says
+    which: the fit of frames is not affected. If the arm's places before and after lie `apart`, its
+    errors may look like a step of that size.
     """
 
-    what: str
+    owners: tuple[str, ...]
     kind: str
     thing: str
     set: int
@@ -52,6 +54,11 @@ class Step:
     """Whether it crept over the whole session."""
     longer: Mapping[str, float] = field(default_factory=dict)
     """By how much [m] the distances of devices are longer from there on, if their zeros moved."""
+
+    @property
+    def what(self) -> str:
+        """Return the owners in words."""
+        return ', '.join(self.owners)
 
     @property
     def harmful(self) -> bool:
@@ -72,7 +79,7 @@ class Step:
 
     @property
     def _are(self) -> str:
-        return 'are' if ', ' in self.what else 'is'
+        return 'are' if len(self.owners) > 1 else 'is'
 
     @property
     def _correction(self) -> str:
@@ -101,7 +108,7 @@ class Step:
         size = self._size
         if self.held:
             off = f'the {self.what} held by the chain file {self._are} off {size}'
-            return Reason(Rule.MISTAKE, f'{off}: correct it, or remove fixed: true there')
+            return Reason(Rule.MISTAKE, f'{off}: {RELEASE}')
         thing, of = self.thing, f' ({self.what})'
         if self.kind in ZEROS:
             thing, of = f'the zero of {self.what}', ''

@@ -359,11 +359,11 @@ class _Scan:
         unused = [where for where, side in sides if found.stop and not weights[side].any()]
         seen, model = problem.sets[of_set], problem.model
         frames = [] if found.stop else dict.fromkeys(Parameter(name).owner for name in group.names)
-        held = ', '.join(name for name in frames if model.frame(name).fixed)
+        held = tuple(name for name in frames if model.frame(name).fixed)
         return Step(
-            what=held or group.what,
+            owners=held or group.owners,
             kind=group.kind,
-            thing=thing_of(group.kind, seen, several=', ' in group.what),
+            thing=thing_of(group.kind, seen, several=len(group.owners) > 1),
             set=of_set,
             sample=int(sample),
             stamp_ns=int(stamp),

@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from calib_ros.decision.moved import RELEASE
 from calib_ros.decision.printed_board import size_of
 from calib_ros.decision.rotation_conventions import misread
 from calib_ros.decision.undoing import (
@@ -69,7 +70,7 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
     """
     if of_images:
         yield from (replace(each, part='measured') for each in _of_boards(chain, sets[0]))
-        for each in _arm_mistakes(chain):
+        for each in _arm_mistakes(chain, sets):
             remedy = each.published if each.in_file else 'correct it in --places'
             yield replace(each, remedy=remedy)
         return
@@ -88,10 +89,10 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
         remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
         what = 'the axes of the measuring device are left-handed'
         yield Suspect(what, remedy, (*back, mirrored, *back), 3, part='handed')
-    yield from _arm_mistakes(chain)
+    yield from _arm_mistakes(chain, sets)
 
 
-def _arm_mistakes(chain: Chain) -> Iterator[Suspect]:
+def _arm_mistakes(chain: Chain, sets: Sets) -> Iterator[Suspect]:
     """Yield mistakes of joint values and the arm."""
     for one, other, unit, size in MIXED_UP_UNITS:
         what = f'the joint values are in {one}, not {other}'
@@ -103,6 +104,7 @@ def _arm_mistakes(chain: Chain) -> Iterator[Suspect]:
     yield from _of_joints(chain)
     yield from _of_one_unit(chain)
     yield from _of_arms(chain)
+    yield from _of_frames(chain, sets)
     for rows in (1, -1, 2, -2):
         what, published = rows_away(rows), 'check the stamps, and delay'
         yield Suspect(what, f'--shift {rows}', rank=2, rows=rows, published=published)
@@ -178,10 +180,6 @@ def _of_coordinates(seen: Observations) -> Iterator[Suspect]:
         own = partial(scaled, axis=k)
         for each in _of_lengths(f'{name} coordinates alone', name, own):
             yield replace(each, changes=(*back, *each.changes, *back))
-
-
-def _other(chain: Chain) -> Convention:
-    return 'modified' if chain.convention == 'standard' else 'standard'
 
 
 def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
@@ -364,25 +362,17 @@ def _of_signs(chain: Chain) -> Iterator[Suspect]:
 
 
 def _of_arms(chain: Chain) -> Iterator[Suspect]:
-    """Yield lengths in mm, the other convention, wrong frames, and arms with like joints."""
+    """Yield lengths in mm, the other convention, wrong signs, and arms with like joints."""
     if too_long(chain):  # a shorter one is of metres: any place fits a tiny arm to its size
         small = [replace(j, a=1e-3 * j.a, b=1e-3 * j.b, d=1e-3 * j.d) for j in chain.joints]
         what, remedy = 'the lengths of the chain file are in mm, not metres', 'give metres there'
         yield Suspect(what, remedy, chain=replace(chain, joints=tuple(small)), published=remedy)
-    other = _other(chain)
+    other: Convention = 'modified' if chain.convention == 'standard' else 'standard'
     what = f'the DH table is in the {other} convention, not the {chain.convention} one'
     remedy = f'convention: {other} in the chain file'
     arm = replace(chain, convention=other, parallel=None)
     yield Suspect(what, remedy, rank=3, chain=arm, published=remedy)
     yield from _of_signs(chain)
-    held = [key for key in ('base', 'tool') if chain.frame(key).fixed]
-    for keys in dict.fromkeys(((*held,), (*held[:1],), (*held[1:],))):
-        if keys:
-            what = f'the chain file gives a wrong {" and ".join(keys)} (fixed: true)'
-            remedy = 'correct it, or remove fixed: true there'
-            base, tool = (None if key in keys else getattr(chain, key) for key in ('base', 'tool'))
-            arm = replace(chain, base=base, tool=tool)
-            yield Suspect(what, remedy, rank=3, chain=arm, published=remedy)
     types = [joint.type for joint in chain.joints]
     for ours in shipped_chains():
         if [joint.type for joint in ours.joints] != types:
@@ -392,5 +382,18 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
             if ours.name == chain.name:
                 what = f'this is not the DH table of a {ours.name}'
             published = f'set chain (--chain) to {ours.name}'
-            arm = replace(ours, base=chain.base, tool=chain.tool)
+            arm = replace(ours, base=chain.base, tool=chain.tool, frames=chain.frames)
             yield Suspect(what, remedy, rank=2, chain=arm, published=published)
+
+
+def _of_frames(chain: Chain, sets: Sets) -> Iterator[Suspect]:
+    """Yield frames that the chain file holds in wrong places: bases and tools, or one kind."""
+    frames = dict(chain.all_frames)
+    held = {name for name, frame in frames.items() if frame and frame.fixed}
+    bases = tuple(dict.fromkeys(each.base for each in sets if each.base in held))
+    tools = tuple(dict.fromkeys(each.tool for each in sets if each.tool in held))
+    for names in filter(None, dict.fromkeys(((*bases, *tools), bases, tools))):
+        what = f'the chain file gives a wrong {" and ".join(names)} (fixed: true)'
+        (_, base), (_, tool), *others = (frames | dict.fromkeys(names)).items()
+        arm = replace(chain, base=base, tool=tool, frames=tuple(others))
+        yield Suspect(what, RELEASE, rank=3, chain=arm, published=RELEASE)

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
@@ -46,10 +48,12 @@ class Broadcast:
             self._base = described.frame('base').matrix
             self._tool = described.frame('tool').matrix
 
-    def publish(self, chain: Chain, world: str, in_hand: bool, outdated: str = '') -> None:
+    def publish(
+        self, chain: Chain, world: str, in_hand: bool, outdated: Collection[str] = ()
+    ) -> None:
         """Publish the frames of a calibrated chain measured in the frame `world`.
 
-        Those `outdated`, joined by commas, have moved since, and are left out.
+        Those `outdated` have moved since, and are left out.
         """
         if self._publisher is None:
             return
@@ -66,9 +70,8 @@ class Broadcast:
                 f'the measurements come in frame "{world}": /tf_static lacks it; give it a name '
                 'other than base_frame, flange_frame and target_frame'
             )
-        for frame in outdated.split(', '):
-            found.pop(frame, None)
-        transforms = [self._transform(*each) for each in found.values() if all(each[:2])]
+        kept = [each for frame, each in found.items() if frame not in outdated and all(each[:2])]
+        transforms = [self._transform(*each) for each in kept]
         self._publisher.publish(self._type(transforms=transforms))
 
     def _transform(self, parent: str, child: str, matrix: FloatArray) -> TransformStamped:

@@ -215,7 +215,7 @@ class Identifying:
         page = partial(_page, given, result)
         if result.accepted:
             found = Calibration.of(result, given.origin, loaded.owners, loaded.problem.sets)
-            outdated = result.step.what if result.step and result.step.outdated else ''
+            outdated = result.step.owners if result.step and result.step.outdated else ()
             published = Published(found.dump(), given.configuration, page, outdated)
             self._accepted(found, published, given.samples)
             self.earlier = ''

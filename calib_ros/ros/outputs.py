@@ -38,13 +38,13 @@ class Published(NamedTuple):
     """A calibration as the text of a file, with its settings, if known.
 
     `page` makes the report of its identification, which takes a while; it returns None if that is
-    not possible. The frame `outdated` moved meanwhile.
+    not possible. The frames `outdated` moved meanwhile.
     """
 
     text: str
     configuration: str
     page: Callable[[], str | None] = lambda: None
-    outdated: str = ''
+    outdated: tuple[str, ...] = ()
 
 
 class Keeper:

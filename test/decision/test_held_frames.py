@@ -70,8 +70,11 @@ def test_a_held_base_of_the_last_session_did_not_move_within_it():
     wrong = true.base.matrix.copy()
     wrong[:3, 3] += [3e-4, 0.0, 4e-4]
     held = replace(true.base, matrix=wrong, fixed=True)
-    chain = replace(SCARA, base=None, tool=None).with_frame('base_2', held)
-    sets = [replace(seen.select(np.arange(72) // 24 == k), base=f'base_{k}') for k in range(3)]
+    names = 'base_0', 'base_1', 'base_2, left'
+    chain = replace(SCARA, base=None, tool=None).with_frame(names[2], held)
+    parts = [seen.select(np.arange(72) // 24 == k) for k in range(3)]
+    sets = [replace(part, base=name) for part, name in zip(parts, names, strict=True)]
     step = find_step(fitting.fit(Problem(chain, sets[0], more=sets[1:], **SIGMAS)))
     assert step.held
-    assert step.what == 'base_2'
+    assert step.owners == names[2:]
+    assert 'left held by the chain file is off by' in str(step)

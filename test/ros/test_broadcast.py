@@ -66,7 +66,7 @@ def test_a_calibration_that_is_loaded_is_broadcast(tmp_path):
         np.testing.assert_allclose(found[key], truth.frame(frame).matrix, rtol=0, atol=1e-12)
 
 
-def broadcast(chain, world='leica', in_hand=False, urdf='', outdated='', **names):
+def broadcast(chain, world='leica', in_hand=False, urdf='', outdated=(), **names):
     given = SimpleNamespace(links={}, **(NAMES | names))
     with Cell() as cell:
         heard = cell.listen(TFMessage, '/tf_static')
@@ -104,6 +104,7 @@ def test_frames_without_a_name_of_their_own_are_left_out():
     assert set(broadcast(chain, base_frame='')) == {('tool0', 'ball')}
     assert set(broadcast(chain, flange_frame='')) == {('leica', 'base_link')}
     assert set(broadcast(chain, world='')) == {('tool0', 'ball')}
-    assert set(broadcast(chain, outdated='base, base_wire')) == {('tool0', 'ball')}
+    assert set(broadcast(chain, outdated=('base', 'base_wire'))) == {('tool0', 'ball')}
+    assert len(broadcast(chain, outdated=('base, tool',))) == 2  # one frame of that name
     with pytest.raises(ConfigError, match='must be different, not tool0, tool0, ball'):
         broadcast(chain, base_frame='tool0')

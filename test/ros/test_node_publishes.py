@@ -79,7 +79,7 @@ def test_an_answer_says_that_the_device_was_moved_meanwhile(cell, recording, fir
         message.pose.position.x += 0.02
     cell.play(topics(recording, measured_pose=poses))
     answer = cell.call('identify')
-    assert (cell.node._keeper._published.outdated == 'base') == (first > STOPS / 2)
+    assert (cell.node._keeper._published.outdated == ('base',)) == (first > STOPS / 2)
     assert answer.success == (first != STOPS / 2)
     assert len(answer.message) <= ANSWER_LENGTH
     assert said.format(f'moved by 20 mm before pose {first + 1}') in answer.message
