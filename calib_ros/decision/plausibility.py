@@ -28,6 +28,7 @@ from calib_ros.decision.steps import EXPLAINED
 from calib_ros.errors import CalibrationError, InputError
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.fitting import fit
+from calib_ros.estimation.gauges import best_imitation
 from calib_ros.estimation.gross_errors import SUSPICIOUS
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, NEARER, SURE, TELLING, chance_of
@@ -162,16 +163,26 @@ def _another_type(problem: Problem, result: Identification) -> str:
 
 
 def _level_hand(problem: Problem, result: Identification) -> str:
-    """Return that couplings which keep the hand level hide an unknown place of the target."""
+    """Return that a hand which stays level hides an unknown place of the target, if that counts.
+
+    A target LEVER off is further off than the remaining error by the tilts of the hand.
+    """
     places = [p.name for p in result.parameters if p.status == 'gauge' and p.name.is_length]
     known = problem.chain.all_frames
     hidden = [n for n in places if n.owner.startswith('tool') and known.get(n.owner) is None]
-    if not (hidden and effects.coupled(problem.chain)):
+    if not hidden:
+        return ''
+    ends = [*parameters_of('base'), *parameters_of('tool')]
+    along = [name for name in ends if name in {f'tool.{n.kind}' for n in hidden}]
+    frames, joints = [n for n in ends if n not in along], problem.sets[0].joints
+    *_, tilted = best_imitation(result.chain, frames, along, joints, 0.0)
+    off = LEVER * np.linalg.norm(tilted) / np.sqrt(len(joints))
+    if off < 1e-3 * (result.validation or result.fitted).figures[1].rms_mm:
         return ''
     return (
-        f'a hand that couplings keep level hides {", ".join(hidden)}, but tilts by errors of the '
-        'arm move the target, the more the further off it is: give tool in the chain file, to a '
-        'centimetre'
+        f'a hand that stays level hides {", ".join(hidden)}, taken as 0, but tilts by errors of '
+        f'the arm: tool points {LEVER:g} m from there are {1e3 * off:.2g} mm off. Give tool in '
+        'the chain file, to a centimetre'
     )
 
 

@@ -129,10 +129,28 @@ def test_the_hidden_height_of_a_target_on_a_level_hand_is_asked_for(rng):
     errors = []
     for tool in (None, roughly):
         result = identify(Problem(replace(level, base=None, tool=tool), seen, **SIGMAS))
-        asked = 'hides tool.z, but tilts by errors of the arm move the target'
+        asked = 'hides tool.z, taken as 0, but tilts by errors of the arm'
         assert any(asked in each for each in result.remarks) == (tool is None)
         errors.append(rms(result.chain, true, level.random_joints(200, rng)))
     assert errors[1] < 0.5 * errors[0]
+
+
+def test_so_is_that_on_a_scara_whose_axes_tilt(rng):
+    """Tool points count from its flange, which the fit puts at the height of the target."""
+    scara = replace(load_chain('denso_hsr065'), base=None, tool=None)
+    tilted = faulty(scara, Cell(), rng).with_offsets({'tool.z': 0.2})
+    upright = replace(tilted, joints=scara.joints).with_offsets({'joint_1.a': 5e-4})
+    q = scara.random_joints(60, rng)
+    for true, tool, told in (
+        (tilted, None, True),
+        (tilted, tilted.tool, False),
+        (upright, None, False),
+    ):
+        seen = measure(true, q, rng, *NOISE)
+        result = identify(Problem(replace(scara, tool=tool), seen, **SIGMAS))
+        assert result.accepted
+        found = [each for each in result.remarks if 'tool points 0.3 m from there are' in each]
+        assert bool(found) is told
 
 
 @pytest.mark.parametrize('second', ['motor" multiplier="-1" offset="0.2', 'outer" multiplier="-2'])
