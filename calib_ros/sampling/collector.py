@@ -194,7 +194,9 @@ class Collector:
             return 'every measurement is taken'
         stands = self.track.standing(self.settings.still, REST_S)
         if not len(stands) or stands[-1, 1] < newest:
-            return 'the arm is moving'
+            long = max(1.0, self.settings.settle + self.settings.shortest_stop)
+            ask = f': let it stand at each pose for {long:g} s'
+            return f'the arm is moving{"" if self.sampler.rested else ask}'
         if stands[-1, 0] <= max(self._sampled_ns, self._seated_ns):
             return 'the arm stands and its pose is measured: move on'
         if (
@@ -203,7 +205,8 @@ class Collector:
             and not self._measured(self._settled_ns, newest)
         ):
             return 'the arm stands, and nothing has been measured yet'
-        return f'the arm stands for {1e-9 * (newest - self._begin(stands)):.1f} s'
+        ask = ': call ~/capture' * (self.settings.mode == 'triggered')
+        return f'the arm stands for {1e-9 * (newest - self._begin(stands)):.1f} s{ask}'
 
     def capture(self, place: str = '') -> tuple[int, str]:
         """Take one sample of each stream now; return their number, or why there is none.
@@ -217,8 +220,6 @@ class Collector:
         newest = self.track.newest_ns
         if not newest:
             return 0, 'no joint states received'
-        if not (self.waiting.count or place):
-            return 0, 'no measurements since the last pose'
         shortest = round(self.settings.shortest_stop * 1e9)
         stopped = len(stands) and stands[-1, 1] >= newest
         if not stopped or newest - self._begin(stands) < shortest:
@@ -226,6 +227,8 @@ class Collector:
                 f'the arm has not been still for {self.settings.shortest_stop:g} s yet '
                 f'(no joint further than {self.settings.still:g} rad or m)'
             )
+        if not (self.waiting.count or place):
+            return 0, 'no measurements since the last pose'
         begin = self._begin(stands)
         if place:
             stamps = self.track.samples()[0]

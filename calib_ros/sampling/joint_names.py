@@ -12,6 +12,7 @@ from calib_ros.estimation.configurations import STILL
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.hints import Hint
 from calib_ros.sampling.slices import JointIndices
+from calib_ros.shown import some
 from calib_ros.values import MOST_NAMES
 
 OTHERS = 'none of the joints in the message'
@@ -90,7 +91,8 @@ class JointNames:
             return f'waiting for joint states with positions: none came of {blank}'
         if not (missing and self.foreign):
             return ''
-        return (
-            f'waiting for joint states, set joint_names? Those received name '
-            f'{", ".join(self.foreign)}, not {", ".join(self._names[k] for k in missing)}'
-        )
+        lacking = ', '.join(some([self._names[k] for k in missing]))
+        others = ', '.join(some([name for name in self.foreign if name not in self._names]))
+        if not others:
+            return f'waiting for joint states of {lacking}'
+        return f'waiting for joint states, set joint_names? Received {others}, not {lacking}'

@@ -124,10 +124,12 @@ def test_a_renamed_joint_is_named(cell, recording, all_renamed):
     answer = cell.refused('identify')
     assert 'set joint_names' in answer.message
     assert names[5] in cell.in_full(answer)
-    said = 'waiting for joint states, set joint_names? Those received name '
+    said = 'waiting for joint states, set joint_names? Received '
     cell.spin_until(lambda: words and words[-1].data.startswith(said))
-    missing = recording.joint_names if all_renamed else recording.joint_names[5:]
-    whole = f'{said}{", ".join(sorted(names))}, not {", ".join(missing)}; '
+    whole = f'{said}tool0, not wrist_3_joint; '
+    if all_renamed:
+        others, missing = ', '.join(sorted(names)[:5]), ', '.join(recording.joint_names[:5])
+        whole = f'{said}{others}, and 1 more, not {missing}, and 1 more; '
     cell.spin_until(lambda: heard and whole in heard[-1].status[0].message)
 
 

@@ -182,7 +182,7 @@ def test_a_long_stand_is_known_from_its_begin(way):
     assert made.capture()[0] == 0
     made = collector(mode='triggered', **{way: 3.0})
     play(made, joint_events(motion, 6.0), pose_events(motion, 6.0), finish=False)
-    assert made.state() == 'the arm stands for 6.0 s'
+    assert made.state() == 'the arm stands for 6.0 s: call ~/capture'
     assert made.capture() == (1, '')
     assert made.capture() == (0, 'no measurements since the last pose')
 

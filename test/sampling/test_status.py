@@ -149,6 +149,35 @@ def test_a_motion_without_stops_is_told_of_mode_continuous(moves):
     assert ('set mode to continuous (--mode continuous)' in made.summary) == moves
 
 
+@pytest.mark.parametrize(('given', 'long'), [({}, '1 s'), ({'settle': 1.5}, '1.7 s')])
+def test_the_status_says_what_is_needed_until_the_arm_has_stopped(given, long):
+    """It was "the arm is moving; 0 poses", and of a call of ~/capture "no measurements"."""
+    made = CalibrationSession(UR5E, Settings(**given))
+    motion = stops(UR5E.random_joints(3, np.random.default_rng(1)), move=2.0, stand=3.0)
+    source, kind, measured = tracker()
+
+    def play(begin, end):
+        for time in np.arange(begin, end, 0.04).tolist():
+            (stamp,), (row,) = stamps(np.array([time])).tolist(), motion([time])
+            state = of_joints(joint_state(stamp, UR5E.joint_names, row.tolist()))
+            take(made, state, (source, kind, measured(stamp, row)))
+
+    play(3.5, 4.5)
+    assert made.status().startswith(f'the arm is moving: let it stand at each pose for {long}; ')
+    assert 'the arm has not been still for 0.2 s yet' in made.capture()[1]
+    play(4.5, 9.7)
+    assert made.status().startswith('the arm is moving; 1 pose')
+
+
+def test_joints_that_do_not_come_are_told_without_those_that_do():
+    """The one that matters was behind the other names, where the status is cut."""
+    names = [*UR5E.joint_names[:5], 'tool0']
+    said = 'waiting for joint states, set joint_names? Received tool0, not wrist_3_joint; '
+    assert named((names, [0.1] * 6)).status().startswith(said)
+    some = named((UR5E.joint_names[:5], [0.1] * 5)).status()
+    assert some.startswith('waiting for joint states of wrist_3_joint; ')
+
+
 def test_the_status_names_a_sample_that_does_not_fit():
     given = samples(50)
     made = session(given[:45])
@@ -263,7 +292,7 @@ def test_what_was_heard_is_remembered_however_the_names_are_arranged(rng):
 
 
 def test_names_that_are_empty_are_shown():
-    assert 'Those received name "", not shoulder' in named(([''] * 6, [0.1] * 6)).status()
+    assert 'Received "", not shoulder' in named(([''] * 6, [0.1] * 6)).status()
 
 
 def test_a_joint_that_moves_but_is_not_in_the_chain_is_told():
