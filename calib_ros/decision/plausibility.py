@@ -88,9 +88,10 @@ def add_remarks(problem: Problem, result: Identification, another: bool = True) 
         sigmas = ''
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
     level, other = _level_hand(problem, result), _another_type(problem, result) if another else ''
+    strain = result.strain * all(each.rule is not Rule.SCALE for each in refusals)
     judged = f'{result.contradiction} {UNEXPECTED}' if another and result.contradiction else ''
     loose, order = loose_target(problem.sets), _order(problem)
-    found = (other, lens, board, judged, coupled, level, loose, motion, order, sigmas)
+    found = (other, lens, board, strain, judged, coupled, level, loose, motion, order, sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=remarks, refusals=tuple(refusals))
 
@@ -105,7 +106,8 @@ def _scale(problem: Problem, result: Identification) -> Iterator[Reason]:
         return
     certain = problem.sigma_scale and found.rival and special.expit(found.rival[0]) > CERTAIN
     if region.by_scale >= HARMFUL or certain:
-        yield Reason(Rule.SCALE, out_of_scale(found.scale, checked=bool(problem.sigma_scale)))
+        text = out_of_scale(found.scale, checked=bool(problem.sigma_scale))
+        yield Reason(Rule.SCALE, result.strain or text)
 
 
 def _arm_distance(chain: Chain, found: Chain, joints: FloatArray) -> float:

@@ -80,6 +80,8 @@ class Identification(Shown):
     surprise: float
     """How many times further off held-out positions are than expected, 0 if not clearly; all
     stated errors are larger accordingly."""
+    strain: str
+    """That the device stretches space in one direction, in words; empty if not."""
     images: int
     """Number of board images fitted."""
     verdicts: tuple[GroupVerdict, ...] = ()

@@ -37,7 +37,7 @@ def bends(sets: Sequence[Samples]) -> list[FloatArray]:
         parts = dict(zip(own, np.split(waves, ends, axis=1), strict=True))
         for k, samples in enumerate(sets):
             none = np.zeros((3 * len(waves), samples.width, samples.count))
-            bent = _rows(samples, parts[k]) if k in parts else none
+            bent = shift_rows(samples, parts[k]) if k in parts else none
             found[k] = np.concatenate([found[k], bent])
     return found
 
@@ -55,14 +55,24 @@ def _polynomials(places: FloatArray, weights: FloatArray) -> FloatArray:
     return np.asarray(basis.T[used] * np.sqrt(total / max(used.sum(), 1)))
 
 
-def _rows(samples: Samples, waves: FloatArray) -> FloatArray:
-    """Return rows (3 M, c, N) of weighted polynomials (M, N) along each axis of the device."""
+def shift_rows(samples: Samples, waves: FloatArray) -> FloatArray:
+    """Return rows (3 M, c, N) of weighted shifts (M, N) along each axis of the device.
+
+    Shifts are in units of `device_sigma`.
+    """
     seen = samples.observations
     axes = seen.rotations if seen.inverse else np.eye(3)[np.newaxis]
     bent = np.einsum('mn,nia->main', waves, np.broadcast_to(axes, (samples.count, 3, 3)))
     bent = bent.reshape(-1, 3, samples.count)
     if samples.whitening is None:
         return np.asarray(bent)
-    covariance = seen.covariances(samples.sigmas)[:, :3, :3]
-    sigma = float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 3.0))
-    return np.asarray(np.einsum('rsn,psn->prn', samples.whitening[:, :3], sigma * bent))
+    shifts = device_sigma(samples) * bent
+    return np.asarray(np.einsum('rsn,psn->prn', samples.whitening[:, :3], shifts))
+
+
+def device_sigma(samples: Samples) -> float:
+    """Return the standard deviation [m] of a coordinate (RMS over samples)."""
+    if samples.whitening is None:
+        return samples.sigmas[0]
+    covariance = samples.observations.covariances(samples.sigmas)[:, :3, :3]
+    return float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 3.0))

@@ -44,13 +44,15 @@ class Inference:
 
     Offsets from the nominal chain are normal about zero. The samples have their weights in the
     fit, at which all is linear, and noise of size `noise` [sigma given]. `rounding` are standard
-    deviations of parameters that rounded joint values move too.
+    deviations of parameters that rounded joint values move too, `scale` is the least one of the
+    scale of the device.
     """
 
     fitted: Fitted
     noise: float
     more: Sequence[str] = ()
     rounding: Mapping[str, float] = field(default_factory=dict)
+    scale: float = 0.0
 
     @cached_property
     def _without_waves(self) -> _Columns:
@@ -111,7 +113,8 @@ class _Columns:
         beside = {name: std for name, std in given.rounding.items() if name in names}
         whole, lengths, self.scale = self.chain, dict[str, float](), SCALE
         if more:
-            whole, lengths, self.scale = lengths_of(self.chain, system)
+            whole, lengths, scale = lengths_of(self.chain, system)
+            self.scale = max(scale, given.scale)
         noise = max(given.noise, HALF_THE_DIGITS)  # parameters that follow all exactly leave none
         if more or beside or waves:
             nuisances = Nuisances(beside, lengths, bool(more), Unmodelled(waves=waves), kept=True)
@@ -128,7 +131,8 @@ class _Columns:
         sized = {n: 'harmonic' if n in higher else size_group(self.chain, n) for n in self.names}
         groups = [None if name in known else sized[name] for name in self.names]
         self.considered = {*groups[len(names) :]} - {*groups[: len(names)]}
-        rest, self._checked = self.arm.stop - len(groups), problem.sigma_scale  # waves
+        rest = self.arm.stop - len(groups)  # waves
+        self._checked = problem.sigma_scale and max(problem.sigma_scale, given.scale)
         self._groups = groups + [None] * rest
         self._given = [known.get(name, np.inf) for name in self.names] + [1.0] * rest
 

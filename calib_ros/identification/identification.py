@@ -26,6 +26,7 @@ from calib_ros.decision.result import Identification
 from calib_ros.decision.risk import region_of
 from calib_ros.decision.rounding import may_be_rounding, rounded_joints, rounding_errors
 from calib_ros.decision.steps import find_step
+from calib_ros.decision.strain import strain_of
 from calib_ros.decision.validation import held_out_excess, validate
 from calib_ros.decision.wires import wrong_distances
 from calib_ros.errors import InputError
@@ -34,7 +35,7 @@ from calib_ros.estimation.considered import considered
 from calib_ros.estimation.evidence import Inference
 from calib_ros.estimation.fitted import Fitted, ParameterRow, SimplerFit, parameter_rows
 from calib_ros.estimation.fitting import SOME, fit
-from calib_ros.estimation.leastsquares import minimise
+from calib_ros.estimation.leastsquares import Fit, minimise
 from calib_ros.estimation.levels import SCALE
 from calib_ros.estimation.normal import normal_equations
 from calib_ros.estimation.observability import observability, trades
@@ -80,19 +81,15 @@ def _identified(
     known = SimplerFit(simpler.chain, simpler.distances, simpler.noise) if simpler else None
     fitted = fit(problem, known)
     problem, names, robust, chain = fitted.problem, fitted.names, fitted.robust, fitted.chain
-    start = fitted.start
     progress(1 / 2)  # with many poses (benchmarks/end_to_end.py)
-    frames = [name for name in names if start.owns_frame(name)]
-    if robust.system.count > 4 * SOME:
-        most = max(SOME, int(EXCEPTION * robust.system.count))
-        start = minimise(start, frames, robust.system.spread(most)).chain
-    before = minimise(start, frames, robust.system, tolerance=1e-5)
+    before = _in_best_frames(fitted)
     explained = simpler.validation.judged if simpler and simpler.validation else None
     progress(2 / 3)
     validation, validated_by = validate(fitted, before.chain, explained)
     coarse, share = rounded_joints(problem), coupling_share(fitted)
     more = considered(chain, names, problem.fixed, problem.sets)
-    inference = Inference(fitted, _size(fitted, share), more, rounding_errors(problem, coarse))
+    (scale, strain), coarsely = strain_of(fitted), rounding_errors(problem, coarse)
+    inference = Inference(fitted, _size(fitted, share), more, coarsely, scale)
     posterior, uncertainty = _inferred(inference)
     surprise, wider = held_out_excess(fitted, posterior, validation)
     uncertainty = replace(uncertainty, parts=wider**2 * uncertainty.parts)
@@ -126,6 +123,7 @@ def _identified(
         remarks=oddities(problem, posterior, step, coarse),
         coupled=share > 0.0,
         surprise=surprise,
+        strain=strain,
         images=sum(count_distinct(s.images) for s in problem.sets if s.pixels is not None),
     )
     own_behaviour = None if step and not step.slow else arms_own(fitted)
@@ -134,6 +132,16 @@ def _identified(
     result = replace(result, refusals=(*result.refusals, *refused))
     named = mistakes.with_mistake(problem, result)
     return plausibility.add_remarks(problem, named, another=named is result)
+
+
+def _in_best_frames(fitted: Fitted) -> Fit:
+    """Return the fit of the frames of the nominal arm."""
+    start, system = fitted.start, fitted.robust.system
+    frames = [name for name in fitted.names if start.owns_frame(name)]
+    if system.count > 4 * SOME:
+        most = max(SOME, int(EXCEPTION * system.count))
+        start = minimise(start, frames, system.spread(most)).chain
+    return minimise(start, frames, system, tolerance=1e-5)
 
 
 def _inferred(inference: Inference) -> tuple[Posterior, Uncertainty]:
@@ -157,9 +165,10 @@ def _region(
     region = of(posterior.widened(wider))
     printed = all(each.pixels is not None for each in problem.sets)
     finer = SCALE if printed else EXCEPTION * SCALE  # as of a tracker
-    if region is None and posterior.scale and not 0.0 < problem.sigma_scale <= finer:
+    doubtful = inference.scale > 0.0 or not 0.0 < problem.sigma_scale <= finer
+    if region is None and posterior.scale and doubtful:
         checked = replace(fitted, problem=replace(problem, sigma_scale=finer))
-        known = replace(inference, fitted=checked).with_mixture(posterior)
+        known = replace(inference, fitted=checked, scale=0.0).with_mixture(posterior)
         if of(known.widened(wider)) is not None:
             return None, posterior.scale
     return region, 0.0

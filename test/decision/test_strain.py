@@ -1,0 +1,95 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A device that stretches space in one direction is told, and its scale is not trusted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import SIGMAS, UR10E, arm, measured_arm
+
+from calib_ros import Observations, Problem, identify, load_chain
+from calib_ros.decision.reasons import Rule
+from calib_ros.decision.strain import strain_of
+from calib_ros.estimation.fitting import fit
+from calib_ros.kinematics import effects
+
+TOLD = 'in one direction of the measuring device lengths come out 0.2'
+SCALE = 2e-3 / 3.0
+
+
+def stretched(seen, size, axis=2):
+    positions = seen.positions.copy()
+    positions[:, axis] *= 1.0 + size
+    return replace(seen, positions=positions)
+
+
+def session(name, seed, errors, size=2e-3, **more):
+    chain = load_chain(name)
+    _, _, seen = measured_arm(seed, 40, chain=chain, errors=errors, **more)
+    return Problem(chain, stretched(seen, size), **SIGMAS)
+
+
+@pytest.mark.parametrize(('name', 'seed', 'errors'), [('abb_irb120', 18, 0.1), ('ur10e', 13, 0.2)])
+def test_a_strained_device_that_may_harm_is_refused(name, seed, errors):
+    """Its scale is off by 0.07 %, more than the errors of the arm; these were accepted."""
+    (refusal,) = identify(session(name, seed, errors)).refusals
+    assert refusal.rule is Rule.SCALE
+    assert refusal.startswith(TOLD)
+    wrong = replace(session(name, seed, errors), sigma_scale=1e-5)  # along one direction
+    assert any(TOLD in each for each in identify(wrong).refusals)
+
+
+def test_a_strain_that_does_no_harm_is_a_remark():
+    result = identify(session('abb_irb120', 0, 0.5))
+    assert result.accepted
+    (remark,) = result.remarks
+    assert remark.startswith(TOLD)
+    assert result.posterior.sizes['scale'] > 1e-4
+    assert not identify(session('abb_irb120', 0, 0.5, 0.0)).remarks
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('own', [True, False])
+def test_the_scale_is_as_uncertain_as_the_strain(oriented, own):
+    problem = session('ur10e', 1, 1.0, oriented=oriented)
+    if own:
+        each = np.diag([2.5e-9] * 3 + [4e-8 * oriented] * 3)
+        seen = replace(problem.observations, covariance=each * np.ones((40, 1, 1)))
+        problem = replace(problem, observations=seen)
+    scale, text = strain_of(fit(problem))
+    assert scale == pytest.approx(SCALE, rel=0.1)
+    assert text.startswith(TOLD)
+
+
+def test_a_wrong_focal_length_shows_in_the_poses_of_a_camera():
+    """The depth is off; each pose has axes of its own."""
+    rng, true, _ = measured_arm(2, 1)
+    q = true.random_joints(40, rng)
+    pose = np.linalg.inv(true.forward(q))  # of a fixed target before a camera on the flange
+    places = pose[:, :3, 3] + rng.normal(scale=5e-5, size=(40, 3))
+    seen = stretched(Observations.from_arrays(q, places, pose[:, :3, :3]), 2e-3).inverted()
+    scale, text = strain_of(fit(Problem(UR10E, seen, **SIGMAS)))
+    assert scale == pytest.approx(SCALE, rel=0.1)
+    assert text.startswith(TOLD)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_an_arm_that_bends_strains_nothing(seed):
+    rng = np.random.default_rng(seed)
+    for group, size in (('gravity', 1e-3), ('eccentricity', 5e-4)):
+        values = {n: size * rng.normal() for n in effects.members(UR10E, group)}
+        true = arm(seed).with_effect_values(values)
+        q = true.random_joints(60, rng)
+        pose = true.forward(q)
+        seen = Observations.from_arrays(q, pose[:, :3, 3] + rng.normal(scale=5e-5, size=(60, 3)))
+        fitted = fit(Problem(UR10E, seen, **SIGMAS))
+        assert fitted.noise.position > 2.0
+        assert strain_of(fitted) == (0.0, '')
+
+
+def test_of_several_devices_none_is_strained_alone():
+    problem = session('ur10e', 1, 1.0)
+    first, other = problem.observations.select(np.arange(20)), problem.observations
+    other = replace(other.select(np.arange(20, 40)), base='base_lab')
+    assert strain_of(fit(Problem(UR10E, first, more=[other], **SIGMAS))) == (0.0, '')
