@@ -17,6 +17,7 @@ from calib_ros.decision.improvement import gain_refusals, harm_refusals
 from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
+from calib_ros.decision.trials import largest_error
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.identifiability import DEGENERATE
@@ -56,7 +57,7 @@ def refusals(
     gained = tuple(gain_refusals(problem, result, validation, sized, scaled))
     before, after = validation.figures
     helps = after.rms_mm < before.rms_mm or all(each.rule is not Rule.GAIN for each in gained)
-    if after.rms_mm > max(1e3 * problem.largest_error, before.rms_mm / ALIKE):
+    if after.rms_mm > max(1e3 * largest_error(problem), before.rms_mm / ALIKE):
         # of a fit that explains nothing the parameters tell nothing
         failed = [each for each in failed if each.rule is not Rule.COMMON_SENSE]
     return (*failed, *gained, *harm_refusals(validation, may_be_rounding, helps))

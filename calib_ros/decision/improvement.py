@@ -13,6 +13,7 @@ from calib_ros.decision.comparison import COUNTS, Comparison, log_gain, mean_squ
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.scale import out_of_scale
+from calib_ros.decision.trials import largest_error
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, CONFIDENT
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags
@@ -34,12 +35,13 @@ def gain_refusals(
     before, after = validation.figures
     judged = validation.deciding
     gain, limit = _gain(validation, 'position', judged)
-    largest = 1e3 * problem.largest_error
+    largest = 1e3 * largest_error(problem)
+    tiny = largest < 1e3 * problem.largest_error
     if after.rms_mm > largest and (before.rms_mm > largest or gain > limit):
         yield Reason(
             Rule.LARGEST_ERROR,
             f'RMS {rounded(after.rms_mm)} mm remains on held-out poses, more than '
-            f'{largest:g} mm (largest_error)',
+            f'{largest:.3g} mm (largest_error{"; less in so small a space" * tiny})',
         )
     if not gain > limit:
         text = f'RMS {before.rms_mm:.3f} mm before, {after.rms_mm:.3f} mm after'

@@ -29,6 +29,7 @@ from calib_ros.decision.trials import (
     as_poses,
     fits_each_side,
     in_frames,
+    largest_error,
     largest_of,
     misfit_set,
     refine_trial,
@@ -89,10 +90,10 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
     """
     if not result.converged or (not result.refusals and result.coupled):
         return True
-    judged = result.validation or result.fitted
+    judged, most = result.validation or result.fitted, largest_error(problem)
     for each in (*judged.figures_of_all, result.fitted.figures_of_all[0]):
         error, angle = 1e-3 * each.rms_mm, 1e-3 * (each.rms_mrad or 0.0)
-        if error > problem.largest_error or angle > problem.largest_angle:
+        if error > most or angle > problem.largest_angle:
             return True
     limits = problem.largest_length, problem.largest_angle
     far = any(each.beyond(*limits) for each in result.parameters)
@@ -314,7 +315,7 @@ def _beam_search(problem: Problem, chain: Chain, given: Trial) -> Diagnosis | No
     or another is no better. The first may be no better alone: two mistakes can hide each other. So
     these are tried together (`hidden`).
     """
-    if given.error <= problem.largest_error:
+    if given.error <= largest_error(problem):
         return None
     few = given.sets
     options = [each for each in suspects(chain, few, _has_images(problem)) if each.part]

@@ -26,7 +26,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray
-from calib_ros.settings import LEVER
+from calib_ros.settings import EXCEPTION, LEVER
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +95,18 @@ def as_poses(problem: Problem, each: Observations) -> Observations:
 def in_frames(problem: Problem, chain: Chain, sets: Sets) -> Trial:
     """Return the arm as given, in the frames that suit it best."""
     return refine_trial(problem, trial_of(chain, tuple(each.spread() for each in sets)))
+
+
+def largest_error(problem: Problem) -> float:
+    """Return the largest error [m] of positions of a faulty arm.
+
+    Of a tiny one a tenth of their spread, but not less than clearly beyond the sigma.
+    """
+    alone = [e for e in problem.sets if e.distances is None and e.pixels is None]
+    placed = [e.given for e in alone if not (e.socket or e.seen)]
+    spreads = [float(np.sqrt(each.var(axis=0).sum())) for each in placed]
+    least = CLEARLY * problem.sigma_position if spreads else np.inf
+    return min(problem.largest_error, max(EXCEPTION * max(spreads, default=0.0), least))
 
 
 def largest_of(problem: Problem) -> float:

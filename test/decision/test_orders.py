@@ -282,4 +282,5 @@ def test_errors_larger_than_those_of_faulty_arms_are_suspicious(what, largest, n
             fitted=SimpleNamespace(figures_of_all=(fitted, None)),
             parameters=(),
         )
-        assert mistakes._suspicious(SimpleNamespace(**limits), result) == (share > 1.0)
+        problem = SimpleNamespace(**limits, sets=())
+        assert mistakes._suspicious(problem, result) == (share > 1.0)

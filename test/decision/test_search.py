@@ -273,5 +273,7 @@ def test_mistakes_at_once_of_images_are_those_of_boards_and_places(pixels, searc
     searched([('a', 1, 'measured'), ('b', 1, 'j1')], {'ab': 0.1})
     both = mistakes.suspects()
     monkeypatch.setattr(mistakes, 'suspects', lambda chain, sets, boards: both if boards else [])
-    images = SimpleNamespace(**vars(FAULTY) | {'sets': [SimpleNamespace(pixels=pixels)]})
+    images = SimpleNamespace(
+        **vars(FAULTY) | {'sets': [SimpleNamespace(pixels=pixels, distances=1)]}
+    )
     assert (_beam_search(images, UR10E, given()) is None) == (pixels is None)
