@@ -193,8 +193,10 @@ def advice_of(problem: Problem, result: Identification) -> tuple[Advice, ...]:
     poses = sum(map(count_distinct, numbers))
     sigma = None if result.images else result.noise.given.get('sigma_position')
     contradicted = bool(held_out) and bool(result.surprise)
-    needless = (*['auto'] * bool(result.verdicts), *['table'] * (not problem.of_messages))
-    about = words.drifts(result.noise), len(result.outliers), contradicted, needless
+    needless = ['images' if result.images else 'poses', *['auto'] * bool(result.verdicts)]
+    needless += ['table'] * (not problem.of_messages)
+    needless += ['wireless'] * (not any(each.of_wire for each in problem.all_sets))
+    about = words.drifts(result.noise), len(result.outliers), contradicted, tuple(needless)
     return advice(result.refusals, Situation(poses, noise, sigma, *about))
 
 

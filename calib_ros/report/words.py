@@ -296,8 +296,8 @@ def neighbours_in_words(noise: Noise) -> str:
         f'Poses {" and ".join(parts)} have similar errors (correlation in brackets): '
         'the device drifts, or the arm has errors that this model lacks.'
     )
-    if (times := f'{noise.widened:.2f}') != '1.00':
-        text += f' This makes the standard deviations {times} times as large.'
+    if noise.widened >= 1.005:
+        text += f' This makes the standard deviations {noise.widened:.2f} times as large.'
     return text
 
 

@@ -114,6 +114,17 @@ def test_publishers_are_told_of_only_if_there_are_some(needless, count):
     assert len(told.steps) == count
 
 
+def test_what_moved_is_told_with_the_steps_of_what_was_measured():
+    """Of a table of poses the second step spoke of images and draw-wires, too."""
+    rows = measured(chain=UR, count=40)
+    moved = replace(rows, positions=rows.positions + 2e-3 * (np.arange(40) > 20)[:, np.newaxis])
+    problem = Problem(UR, moved)
+    (told, *_) = report_of(problem, identify(problem)).advice
+    assert told.heading == refusals.rules()[Rule.MOVED].heading
+    assert len(told.steps) == 2
+    assert not any('images' in each or 'wire' in each for each in told.steps)
+
+
 @pytest.mark.parametrize('poses', [14, 50])
 def test_a_device_finer_than_stated_is_to_be_stated_first(poses):
     """The stated sigma may alone make a correction uncertain that held-out poses confirm."""
