@@ -38,6 +38,7 @@ MOST_NODES = LARGEST_TEXT // 20
 """Values in a YAML document with expanded aliases; 20 characters count as one."""
 MARKUP = re.compile(r'[\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_])|^[>#+-]')
 """Markdown markup; underscores only where they may start emphasis."""
+TABS = re.compile(r'^ *\t', re.MULTILINE)
 FORMULA = re.compile(r"'*[=+\-@\t\r]")
 """Start of a spreadsheet formula, after any apostrophes."""
 
@@ -127,6 +128,7 @@ def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigErro
         raise
     except Exception as err:  # explicit tags fail in many ways
         words = ' '.join(str(err).split()).replace(' in "<unicode string>"', '')
+        words += ': indent with blanks, not tabs' * bool(TABS.search(text))
         raise error(f'{where} is not valid YAML: {words}') from err
     if len(documents) > 1:
         raise error(f'{where} must hold one YAML document, not {len(documents)}')

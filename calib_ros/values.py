@@ -46,7 +46,8 @@ def parse_number(
     except (ValueError, OverflowError):
         number = math.nan
     if isinstance(value, bool) or not math.isfinite(number):
-        raise error(f'{where} must be a finite number, not {value!r:.100}')
+        how = ': write it out, such as 1.5708' if isinstance(value, str) else ''
+        raise error(f'{where} must be a finite number, not {value!r:.100}{how}')
     if abs(number) > largest:
         raise error(f'{where} must be at most {largest:g}, not {number:g}')
     return number
@@ -91,6 +92,8 @@ def parse_mapping(
             f'{where} must be a mapping with the keys {", ".join(keys)}, not {found}'
         )
     for key in value:
+        if type(key) in (int, float):  # {a: 0,5}
+            raise ConfigError(f'{where}: a number has no key: write 0.5, not 0,5')
         if key not in keys:
             raise UnknownNameError(f'{where}: key', str(key), keys)
     for key in needed:

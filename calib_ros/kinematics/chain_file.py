@@ -50,6 +50,7 @@ FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay', 'lens')
 JOINT_KEYS = ('name', 'type', *ROW_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
 TWO_TURNS = 4.0 * math.pi
 """Largest angle of a table [rad]; tables in degrees exceed it."""
+EXAMPLE = 'calib_ros chain ur10e prints one to edit'
 URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
 
 
@@ -66,7 +67,7 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
     if not path.suffix and not path.is_file():
         robots = shipped_robots()
         if (name := str(name_or_path).lower()) not in robots:
-            another = 'another arm needs a URDF or a chain file'  # a UR5 is no UR5e
+            another = f'another arm needs a URDF or a chain file ({EXAMPLE})'  # a UR5 is no UR5e
             if path.is_dir():
                 raise ConfigError(
                     f'{path} is a folder, no arm: give the name of a robot, a URDF or a chain '
@@ -81,7 +82,7 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
             raise
         raise ConfigError(
             f'{path} is no chain file (.yaml) or URDF: give the arm, by its file or name, as '
-            '--chain, and measurements without an option'
+            f'--chain ({EXAMPLE}), and measurements without an option'
         ) from err
     _refuse_other_units(chain, str(path))
     return chain
@@ -168,7 +169,10 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
     content = parse_mapping(document, CHAIN_KEYS, where, ('convention', 'joints'))
     rows = content['joints']
     if not isinstance(rows, list) or not rows:
-        raise ConfigError(f'{where}: "joints" must be a list with one entry per joint')
+        raise ConfigError(
+            f'{where}: "joints" must be a list with one entry per joint, such as '
+            '- {name: A1, a: 0, alpha: 1.5708, d: 0.4, theta: 0}'
+        )
     if len(rows) > MOST_NAMES:
         raise ConfigError(f'{where}: {len(rows)} joints are more than {MOST_NAMES}')
     parallel = content.get('parallel')

@@ -155,6 +155,9 @@ WRONG = [
     ('type: revolute', 'type: revolut', '"joint_1" "revolut": did you mean "revolute"'),
     ('a: 0.0', 'a: .nan', 'joint 1: a must be a finite number, not nan'),
     ('d: 0.1273', 'd: twelve', "joint 1: d must be a finite number, not 'twelve'"),
+    ('d: 0.1273', 'd: pi/2', "joint 1: d must be .*, not 'pi/2': write it out, such as 1.5708"),
+    ('d: 0.1273', 'd: 0,075', 'joint 1: a number has no key: write 0.5, not 0,5'),  # "key 61"
+    ('joints:\n', 'joints:\n\t', 'not valid YAML: .*: indent with blanks, not tabs'),
     ('d: 0.1273', 'd: [1]', 'joint 1: d must be a finite number'),
     ('d: 0.1273', 'd: yes', 'joint 1: d must be a finite number, not True'),
     ('d: 0.1273, ', '', 'joint 1: key "d" is missing'),
@@ -265,7 +268,8 @@ def test_every_shipped_robot_is_read(tmp_path, monkeypatch):
 
 
 def test_an_unknown_robot_lists_those_there_are():
-    with pytest.raises(UnknownNameError, match=r'"ur5": valid: .*; another arm needs') as caught:
+    said = r'"ur5": valid: .*; another arm needs .* \(calib_ros chain ur10e prints'
+    with pytest.raises(UnknownNameError, match=said) as caught:
         load_chain('ur5')  # no ur5e
     assert set(caught.value.alternatives) == set(shipped_robots())
     assert all(robot in str(caught.value) for robot in GOLDEN)
