@@ -50,21 +50,29 @@ def imported(path):
 
 
 def near(module):
-    """Yield the tests that import a module of their folder, then its importers, ... until all."""
-    tests = {path: imported(path) for path in Path('test', module.parts[1]).glob('test_*.py')}
+    """Yield the tests of its folder that import a module, then those of its importers, and so on.
+
+    Without any, those of other folders that import it, or else all of its folder.
+    """
+    left = {path: imported(path) for path in Path('test', module.parts[1]).glob('test_*.py')}
     users = {path: imported(path) for path in module.parent.glob('*.py')}
-    ring = {module}
+    tests, ring, names = {*left}, {module}, {_name(module)}
     while ring:
-        names = {'.'.join(path.with_suffix('').parts) for path in ring}
         files = {f'test_{path.stem}.py' for path in ring}
-        found = {path for path, each in tests.items() if each & names or path.name in files}
+        found = {path for path, each in left.items() if each & names or path.name in files}
         if found:
             yield sorted(map(str, found))
-        tests = {path: each for path, each in tests.items() if path not in found}
+        left = {path: each for path, each in left.items() if path not in found}
         users = {path: each for path, each in users.items() if path not in ring}
         ring = {path for path, each in users.items() if each & names}
-    if tests:
-        yield sorted(map(str, tests))
+        names = {_name(path) for path in ring}
+    if len(left) == len(tests):
+        others = {p for p in Path('test').glob('*/test_*.py') if _name(module) in imported(p)}
+        yield sorted(map(str, others or tests))
+
+
+def _name(path):
+    return '.'.join(path.with_suffix('').parts)
 
 
 def chosen(parts, count, seed, jobs):
