@@ -14,6 +14,7 @@ from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.chain_file import (
+    calibration_record,
     dump_chain,
     load_chain,
     parse_chain,
@@ -352,3 +353,16 @@ def test_a_large_d_between_parallel_axes_is_no_length_in_millimetres(tmp_path):
     text = text.replace('d: 0.163941', 'd: -130.836059')
     (tmp_path / 'cell.yaml').write_text(text)
     assert load_chain(tmp_path / 'cell.yaml').joints[1].d == 439.0
+
+
+def test_a_folder_is_no_arm(tmp_path):
+    with pytest.raises(ConfigError, match=r'is a folder, no arm: .* the calibration.yaml in it'):
+        load_chain(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ('text', 'record'),
+    [('calibration: {robot: r7}', {'robot': 'r7'}), ('calibration: 3', {}), ('name: arm', {})],
+)
+def test_the_record_of_a_chain_file_is_none_or_a_mapping(text, record):
+    assert calibration_record(text) == record

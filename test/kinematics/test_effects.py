@@ -311,3 +311,21 @@ def test_waves_are_sines_and_cosines_however_many(rng, orders):
     for order, (sin, cos) in zip(orders, found.reshape(-1, 2, len(q)), strict=True):
         np.testing.assert_allclose(sin, np.sin(order * q[:, 1]), rtol=0, atol=1e-13)
         np.testing.assert_allclose(cos, np.cos(order * q[:, 1]), rtol=0, atol=1e-13)
+
+
+def test_held_joints_follow_their_couplings_one_after_another():
+    joints = (Joint('a'), Joint('c', lower=0.3, upper=0.3), Joint('b', lower=0.1, upper=0.1))
+    arm = Chain('arm', 'standard', joints)
+    led = arm.with_effect_values({'b.coupling_a': 0.5, 'c.coupling_b': 2.0})
+    values = np.array([[1.0, -2.0], [7.0, 7.0], [7.0, 7.0]])
+    given = values.copy()
+    b = 0.1 + 0.5 * values[0]
+    np.testing.assert_allclose(effects.couple_held(led, values), [values[0], 0.3 + 2.0 * b, b])
+    rates = [values[0], values[0], 0.5 * values[0]]
+    np.testing.assert_allclose(effects.couple_held(led, values, rates=True), rates)
+    still = [values[0], [0.3, 0.3], [0.1, 0.1]]
+    np.testing.assert_allclose(effects.couple_held(led, values, couplings=False), still)
+    np.testing.assert_allclose(effects.couple_held(arm, values), still)
+    free = Chain('arm', 'standard', (Joint('a'), Joint('b')))
+    np.testing.assert_array_equal(effects.couple_held(free, values[:2]), values[:2])
+    np.testing.assert_array_equal(values, given)

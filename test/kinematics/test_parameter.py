@@ -36,3 +36,17 @@ def test_a_parameter_is_its_name(owner: str, kind: str, unit: str) -> None:
     copies = (copy.deepcopy(one), pickle.loads(pickle.dumps(one)))
     assert [type(each) for each in copies] == [Parameter, Parameter]
     assert copies == (one, one)
+
+
+@pytest.mark.parametrize(
+    ('name', 'factor', 'unit'),
+    [
+        ('elbow.a', 1e3, 'mm'),
+        ('elbow.theta', 1e3, 'mrad'),
+        ('elbow.coupling_a', 1e3, '‰'),
+        ('camera.fx', 1.0, 'px'),
+        ('camera.k1', 1.0, '1'),
+    ],
+)
+def test_errors_are_shown_in_thousandths_except_of_lenses(name, factor, unit):
+    assert Parameter(name).small_unit == (factor, unit)

@@ -1,9 +1,12 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import warnings
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from calib_ros.kinematics import se3
 
@@ -67,3 +70,14 @@ def test_quaternions_come_back_with_a_positive_w(seed):
     unit = quat / np.linalg.norm(quat, axis=1, keepdims=True)
     found = se3.to_quat(se3.from_quat(quat))
     np.testing.assert_allclose(found, unit * np.sign(unit[:, 3:]), atol=1e-12)
+
+
+def test_angles_about_axes_in_an_order():
+    angles = np.random.default_rng(0).uniform(-1.5, 1.5, (2, 4, 3))
+    turns = Rotation.from_euler('ZYX', angles.reshape(-1, 3)).as_matrix().reshape(2, 4, 3, 3)
+    np.testing.assert_allclose(se3.to_euler(turns, 'ZYX'), angles)
+    locked = Rotation.from_euler('ZYX', [0.3, np.pi / 2, 0.4]).as_matrix()
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        found = se3.to_euler(locked, 'ZYX')
+    np.testing.assert_allclose(Rotation.from_euler('ZYX', found).as_matrix(), locked, atol=1e-9)
