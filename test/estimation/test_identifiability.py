@@ -9,6 +9,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.estimation.gauges import best_imitation
 from calib_ros.estimation.identifiability import independent
 from calib_ros.estimation.observability import correlated, observability, trades
 from calib_ros.estimation.observations import Observations
@@ -249,3 +250,27 @@ def test_the_ellipsoid_is_that_of_the_covariance_of_a_position(size, level, rng)
     np.testing.assert_allclose(
         products - lengths[:, None] * np.eye(3), 0.0, atol=1e-6 * lengths.max()
     )
+
+
+@pytest.mark.parametrize('lever', [0.5, 2.0])
+def test_frames_imitate_a_zero_of_the_first_joint_and_nothing_else_as_well(lever, rng):
+    names, others = ['base.rz', 'base.x'], ['shoulder_pan_joint.theta', 'elbow_joint.a']
+    q = UR10E.random_joints(50, rng)
+    found, wanted, left = best_imitation(UR10E, names, others, q, lever)
+    np.testing.assert_allclose(found[:, 0], [1.0, 0.0], atol=1e-9)
+    rows = ErrorModel(UR10E, [*names, *others]).jacobian(q)
+    rows[:, 3:] *= lever
+    own, by_others = np.split(rows.reshape(-1, 4), 2, axis=1)
+    np.testing.assert_allclose(wanted, by_others)
+    np.testing.assert_allclose(left, by_others - own @ found, atol=1e-12)
+    np.testing.assert_allclose(own.T @ left, 0.0, atol=1e-9)
+    assert np.linalg.norm(left[:, 1]) > 0.5 * np.linalg.norm(by_others[:, 1])
+
+
+def test_what_shows_nowhere_imitates_nothing(rng):
+    still = np.tile(UR10E.random_joints(1, rng), (5, 1))
+    backlash = ['elbow_joint.backlash']
+    arm = UR10E.with_effects(backlash)
+    for approach, imitated in ((np.zeros((5, 6)), 0.0), (np.ones((5, 6)), 1.0)):
+        found, *_ = best_imitation(arm, backlash, ['elbow_joint.theta'], still, 1.0, approach)
+        np.testing.assert_allclose(found, [[imitated]], atol=1e-9)

@@ -170,3 +170,16 @@ def test_a_part_keeps_the_configurations_of_the_whole(rng):
             same, anew.configurations[:, np.newaxis] == anew.configurations
         )
         assert set(known) == set(range(len(set(known))))
+
+
+def test_frames_of_observations_are_renamed():
+    seen = Observations.from_arrays(np.zeros((2, 6)), np.ones((2, 3)))
+    seen = seen.changed(base='base_hall', tool='tool_ball')
+    for names, ends in (
+        ({}, ('base_hall', 'tool_ball')),
+        ({'base_hall': 'base'}, ('base', 'tool_ball')),
+        ({'tool_ball': 'tool_tip', 'tool': 'tool_x'}, ('base_hall', 'tool_tip')),
+    ):
+        found = seen.between(names)
+        assert (found.base, found.tool) == ends
+        np.testing.assert_array_equal(found.joints, seen.joints)
