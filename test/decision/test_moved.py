@@ -1,0 +1,105 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What moved during the session, in whole sentences."""
+
+from dataclasses import replace
+
+import pytest
+
+from calib_ros.decision.moved import BEFORE_THAT, FROM_THERE, Step
+from calib_ros.decision.reasons import Rule
+
+AGAIN = ', measure again after ~/clear'
+SIZE = 1.234e-3
+FRAME = Step('base', 'base', 'the device', 0, 4, 0, SIZE, 'm', 0.3, '', 'row 5')
+JOINT = replace(FRAME, what='elbow_joint', kind='joint', thing='the joint', unit='rad')
+LOAD = replace(FRAME, what='load', kind='load', thing='the load of the arm')
+WIRES = {'wire': 2e-3, 'other': -1e-3}
+ZERO = replace(FRAME, what='wire', kind='zero', thing='the device', longer=WIRES)
+
+
+@pytest.mark.parametrize(
+    ('step', 'said', 'told'),
+    [
+        (
+            FRAME,
+            'the device moved by 1.2 mm (base) before row 5',
+            f'base moved by 1.2 mm before pose 7{AGAIN}',
+        ),
+        (
+            replace(FRAME, unused=FROM_THERE),
+            'the device moved by 1.2 mm (base) before row 5; measurements from there on carry no '
+            'weight: base is outdated, measure again',
+            f'base moved by 1.2 mm before pose 7 and is outdated{AGAIN}',
+        ),
+        (
+            replace(FRAME, unused=BEFORE_THAT, what='base, base_b'),
+            'the device moved by 1.2 mm (base, base_b) before row 5; measurements before that '
+            'carry no weight',
+            'base, base_b moved by 1.2 mm before pose 7',
+        ),
+        (
+            replace(FRAME, slow=True, longer=WIRES, unused=FROM_THERE),
+            'the device seems to have moved slowly, by 1.2 mm over the session (base); if the '
+            'poses follow an order, errors of the arm may look so: mix them; measurements from '
+            'there on carry no weight',
+            'base moved by 1.2 mm before pose 7',
+        ),
+        (
+            replace(FRAME, apart=True),
+            'the device moved by 1.2 mm (base) before row 5; errors of the arm may look so, as '
+            'poses before and after lie apart: mix them',
+            f'base moved by 1.2 mm before pose 7{AGAIN}',
+        ),
+        (
+            JOINT,
+            'the zero of elbow_joint moved by 1.2 mrad before row 5',
+            f'the zero of elbow_joint moved by 1.2 mrad before pose 7{AGAIN}',
+        ),
+        (
+            LOAD,
+            'the load of the arm changed before row 5: poses differ by 1.2 mm; measure with one '
+            'load, or fit only the poses before or only those after',
+            f'the load of the arm changed before pose 7{AGAIN}',
+        ),
+        (
+            ZERO,
+            'the zero of wire moved by 1.2 mm before row 5; subtract 2 mm from the distances of '
+            'wire and add 1 mm to the distances of other from there on',
+            f'the zero of wire moved by 1.2 mm before pose 7{AGAIN}',
+        ),
+        (
+            replace(ZERO, unused=BEFORE_THAT),
+            'the zero of wire moved by 1.2 mm before row 5; measurements before that carry no '
+            'weight; add 2 mm to the distances of wire and subtract 1 mm from the distances of '
+            'other before that',
+            'the zero of wire moved by 1.2 mm before pose 7',
+        ),
+    ],
+)
+def test_what_moved_is_told(step, said, told):
+    assert str(step) == said
+    assert step.told(7) == told
+    rule = Rule.ENCODER if step.kind == 'joint' else Rule.MOVED
+    assert step.reason.rule is rule
+    assert step.reason.short == said.split(';')[0].split(':')[0]
+    assert step.harmful == (AGAIN in told and not step.outdated)
+
+
+@pytest.mark.parametrize(('what', 'are'), [('tool', 'is'), ('tool, tool_b', 'are')])
+def test_a_frame_held_in_the_wrong_place_is_told(what, are):
+    reason = replace(FRAME, what=what, kind='tool', held=True).reason
+    assert reason.rule is Rule.MISTAKE
+    assert reason == (
+        f'the {what} held by the chain file {are} off by 1.2 mm: correct it, or remove fixed: '
+        'true there'
+    )
+
+
+def test_several_zeros_are_of_the_arm():
+    step = replace(JOINT, kind='joints', thing='the zeros of several joints')
+    assert (
+        step.reason == 'the zeros of several joints changed before row 5: poses differ by 1.2 mrad'
+    )
+    assert step.reason.rule is Rule.ENCODER
+    assert replace(step, unused=FROM_THERE).harmful
