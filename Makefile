@@ -107,4 +107,4 @@ docs: $(VENV)/installed
 	$(BIN)/python -m mkdocs build --strict
 
 clean:
-	rm -rf $(VENV) $(OLDEST) demo build install log *.egg-info
+	rm -rf $(VENV) $(OLDEST) demo mutants build install log *.egg-info

@@ -1,5 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from commanded import twist
@@ -9,6 +11,7 @@ from calib_ros.apply.simulation import random_frame
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame, Joint
+from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.kinematics.parameter import FRAME_KINDS, ROW_KINDS
 
@@ -102,3 +105,19 @@ def test_the_delay_is_that_of_its_own_device():
     np.testing.assert_array_equal(second[:, :, 0], 0.0)
     np.testing.assert_allclose(first[:, 1, 0], -1.0)
     np.testing.assert_allclose(second[:, 1, 1], -1.0)
+
+
+def test_points_beside_the_target_are_targets_of_a_longer_tool(rng):
+    arm, points = load_chain('ur10e'), rng.normal(size=(5, 3))
+    tool, base = random_frame(rng, 0.2), random_frame(rng, 1.0)
+    names = ['base.x', 'base.rz', 'elbow_joint.a', 'wrist_1_joint.theta']
+    q = arm.random_joints(5, rng)
+    model = ErrorModel(replace(arm, base=base, tool=tool), names)
+    axes, origins, shift, turn, _ = model.linearise(q.T, points=points.T)
+    for k, point in enumerate(points):
+        longer = replace(tool, matrix=tool.matrix @ se3.transform(np.eye(3), point))
+        one = ErrorModel(replace(arm, base=base, tool=longer), names).linearise(q[k : k + 1].T)
+        found = axes[..., k], origins[:, k], shift[:-1, :, k], turn[:-1, :, k]
+        expected = one[0], one[1], one[2][:-1], one[3][:-1]
+        for ours, alone in zip(found, expected, strict=True):
+            np.testing.assert_allclose(ours, alone.reshape(ours.shape), atol=1e-12)
