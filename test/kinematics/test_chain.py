@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from calib_ros.errors import ConfigError
+from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.joint import Frame
 from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS
@@ -147,6 +148,11 @@ ONE = row_of((HALF, 0.0), 'standard')
         (lambda: ONE.value('j3.a'), 'unknown parameter "j3.a"'),
         (lambda: ONE.frame('base_2'), 'unknown frame "base_2": .*valid: base, tool'),
         (lambda: replace(ONE, parallel=('j3',)), 'unknown joint in "parallel" "j3"'),
+        (lambda: Joint('j', 'screw'), 'unknown type of joint "j" "screw": valid: '),
+        (
+            lambda: Joint('j', lower=2.0, upper=1.0),
+            'limits of joint "j": lower 2.0 must not exceed upper 1.0',
+        ),
         (lambda: Joint('j', sign=2), 'sign of joint "j" must be 1 or -1, not 2'),
         (lambda: Joint('j', d=np.nan), 'd of joint "j" must be a finite number'),
     ],
@@ -154,3 +160,16 @@ ONE = row_of((HALF, 0.0), 'standard')
 def test_what_is_no_chain_and_no_change_of_one_is_refused(made, said):
     with pytest.raises(ConfigError, match=said):
         made()
+
+
+def test_a_frame_moves_along_and_turns_about_the_axes_of_its_parent():
+    start = Frame(se3.transform(se3.turned(0.1, 0.2, 0.3), np.array([1.0, 2.0, 3.0])), delay=0.1)
+    moved = start.moved({'x': 0.5, 'rz': 0.4})
+    np.testing.assert_allclose(moved.matrix[:3, 3], [1.5, 2.0, 3.0])
+    turn = moved.matrix[:3, :3] @ start.matrix[:3, :3].T
+    np.testing.assert_allclose(turn, se3.turned(0.0, 0.0, 0.4), atol=1e-15)
+    np.testing.assert_allclose(moved.offsets(start), [0.5, 0.0, 0.0, 0.0, 0.0, 0.4], atol=1e-12)
+    np.testing.assert_array_equal(start.moved({}).matrix, start.matrix)
+    assert (moved.delay, start.moved({'delay': 0.05}).delay) == (0.1, pytest.approx(0.15))
+    assert Frame().moved({'delay': 0.05}).delay == 0.05
+    assert Frame(fixed=True).moved({'y': 1.0}).fixed
