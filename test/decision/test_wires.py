@@ -79,6 +79,11 @@ def test_the_zeros_of_several_draw_wires_are_named_together():
     result = identify(Problem(UR10E, wires[0], more=wires[1:]))
     found = re.findall(r'base_\d (\S+) mm', result.refusals[0])
     np.testing.assert_allclose([float(each) for each in found], [5.0, -8.0], atol=0.5)
+    assert re.fullmatch(
+        r'distances are too long by the zeros of their devices \(base_0 \S+ mm, base_1 \S+ mm\): '
+        r'subtract these',
+        result.refusals[0],
+    )
     assert result.step is None
 
 
@@ -135,7 +140,11 @@ def test_a_scale_and_a_zero_of_one_draw_wire_are_named_together():
         sets.append(replace(wire, distances=(1.0 + scale) * far + zero, base=name))
     problem = Problem(UR10E, sets[0], more=sets[1:2])
     (found,) = told(fit(problem))
-    assert re.match(r'all distances are 3\S+ mm too long, by the zero, and \S+ % too long', found)
+    assert re.match(
+        r'all distances are 3\S+ mm too long, by the zero, and \S+ % too long, by the scale: if '
+        r'all else is true to scale, --columns distance=',
+        found,
+    )
     factor, shift = re.search(r'distance=distance\*(\S+)(-\S+) \(if in metres\)', found).groups()
     assert float(factor) == pytest.approx(1.0 / 1.01, abs=5e-4)
     distances = sets[1].distances * float(factor) + float(shift)
@@ -145,6 +154,8 @@ def test_a_scale_and_a_zero_of_one_draw_wire_are_named_together():
     (found,) = told(fit(Problem(UR10E, sets[0], more=sets[1:])))
     pattern = r'(base_\w+) (\S+) mm and (\S+) %'
     sizes = {name: [float(each) for each in pair] for name, *pair in re.findall(pattern, found)}
+    assert found.startswith('distances are too long by the zeros and scales of their devices (')
+    assert found.endswith('): if all else is true to scale, subtract these')
     np.testing.assert_allclose(sizes['base_one'], (30.0, 1.0), rtol=0.05)
     np.testing.assert_array_less(np.abs(sizes['base_other']), (0.3, 0.01))  # mm, %
 
@@ -183,7 +194,10 @@ def test_an_anchor_that_yields_is_named():
     pull = cable / norms(cable)[:, np.newaxis]
     far = norms(cable - 0.02 * pull * [1.0, 0.0, 0.0])
     (found, *_) = identify(Problem(UR10E, replace(seen, distances=far))).refusals
-    assert 'or its stand yields' in found
+    assert found == (
+        'distances depend on the direction of the cable: it leaves over a pulley or an edge, or '
+        'its stand yields. Lead it out of a small hole in a firm stand, and measure again'
+    )
 
 
 @pytest.mark.parametrize('jump', [0.005, -0.02])
