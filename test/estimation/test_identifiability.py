@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.estimation.gauges import best_imitation
+from calib_ros.estimation.gauges import best_imitation, identifiable_and_held
 from calib_ros.estimation.identifiability import independent
 from calib_ros.estimation.observability import correlated, observability, trades
 from calib_ros.estimation.observations import Observations
@@ -274,3 +274,23 @@ def test_what_shows_nowhere_imitates_nothing(rng):
     for approach, imitated in ((np.zeros((5, 6)), 0.0), (np.ones((5, 6)), 1.0)):
         found, *_ = best_imitation(arm, backlash, ['elbow_joint.theta'], still, 1.0, approach)
         np.testing.assert_allclose(found, [[imitated]], atol=1e-9)
+
+
+def test_sockets_and_planes_alone_leave_the_size_to_the_longest_length(rng):
+    arm, names = UR10E, UR10E.parameter_names
+    points = Observations.from_arrays(arm.random_joints(5, rng), np.zeros((5, 3)))
+    socket = points.changed(socket=True)
+    plane = points.changed(plane=True, distances=np.zeros(5))
+    wire = points.changed(distances=np.ones(5))
+    for sets in ([points], [wire], [socket, points], [socket, wire]):
+        assert identifiable_and_held(arm, names, sets)[1] == ()
+    elbow = replace(arm.joints[2], a=-0.7)  # longer than the upper arm
+    other = replace(arm, joints=(*arm.joints[:2], elbow, *arm.joints[3:]))
+    for sets in ([socket], [plane]):
+        for chain, longest in ((arm, 'shoulder_lift_joint.a'), (other, 'elbow_joint.a')):
+            found, held = identifiable_and_held(chain, names, sets)
+            assert held == (longest,)
+            assert longest not in found
+            assert len(found) == 23
+    without = [name for name in names if name != 'shoulder_lift_joint.a']
+    assert identifiable_and_held(arm, without, [socket])[1] == ()
