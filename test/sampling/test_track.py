@@ -292,3 +292,27 @@ def test_a_full_track_is_halved(capacity):
     assert held.tolist() == [k * MS for k in range(500 - len(held), 500)] or capacity == 1
     if capacity > 3:
         assert capacity // 2 <= len(held) <= capacity
+
+
+# Noise
+
+
+def test_the_noise_of_a_joint_at_rest_is_that_of_its_newest_samples():
+    rng = np.random.default_rng(0)
+    sizes = np.where(np.arange(400) < 200, 1e-3, 1e-5)[:, np.newaxis] * [0.5, 1.0]
+    values = rng.normal(size=(400, 2)) * sizes + [3.14159, -1.0]  # about half a turn
+    made = filled([(10 * k, row) for k, row in enumerate(values)])
+    assert made.noise_at_rest(1500 * MS, 1990 * MS) == pytest.approx(1e-3, rel=0.2)
+    assert made.noise_at_rest(1500 * MS, 3990 * MS) == pytest.approx(1e-5, rel=0.2)
+    assert made.noise_at_rest(10 * MS, 3990 * MS) == pytest.approx(1e-5, rel=0.8)  # of a few
+    assert made.noise_at_rest(1500 * MS, 60 * MS) is None  # too few there are
+    assert made.noise_at_rest(1500 * MS, 70 * MS) == pytest.approx(1e-3, rel=0.8)
+
+
+def test_a_joint_that_moves_tells_no_noise():
+    rng = np.random.default_rng(0)
+    values = 1e-4 * rng.normal(size=(100, 2)) + 1e-3 * np.arange(100)[:, np.newaxis] * [0.0, 1.0]
+    assert (
+        filled([(10 * k, row) for k, row in enumerate(values)]).noise_at_rest(500 * MS, 990 * MS)
+        is None
+    )
