@@ -129,6 +129,13 @@ def test_slices_pass_as_single_messages_do(messages, size):
     assert (one.dropped, one.held(JOINTS)) == (many.dropped, many.held(JOINTS))
 
 
+def test_joint_states_far_back_are_stray_though_a_measurement_is_near():
+    given = [(POSES, 0.3), (JOINTS, 0.9), (JOINTS, 1.8), (JOINTS, 0.5), (JOINTS, 2.0)]
+    passed, gate = through(given, far=1.0)
+    assert passed == [*given[:3], given[4]]
+    assert gate.dropped == {f'joints: {STRAY}': 1}
+
+
 def passing(gate, messages):
     return [
         (each.kind, int(each.stamps[0]))
