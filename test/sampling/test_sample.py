@@ -43,6 +43,10 @@ def test_no_socket_and_no_plane_is_the_first():
     assert frames.of(wall) == ('base_wall', 'tool')
     for known in (Frames(frames.owners), frames):
         assert known.of(labelled('s', 'tracker', '', False)) == ('base', 'tool')
+    tip = replace(wall, target='tip')
+    assert frames.of(tip) == ('base_wall', 'tool_tip')  # the other target is the first
+    assert frames.of(replace(tip, session='t')) == ('base_t_wall', 'tool_t')
+    assert frames.of(replace(hole, session='t')) == ('base_t_hole', 'tool_t')
 
 
 @pytest.mark.parametrize('kind', ['socket', 'plane'])
