@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib_ros.decision.moved import RELEASE
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.suspects import ORIENTATIONS
 from calib_ros.decision.undoing import Suspect
@@ -31,6 +32,11 @@ class Diagnosis:
         """Tell whether this refuses a result by itself."""
         other = ORIENTATIONS.what
         return all(each.rank and not each.chain and each.what != other for each in self.suspects)
+
+    @property
+    def of_frames(self) -> bool:
+        """Tell whether the chain file only holds frames in wrong places."""
+        return all(each.remedy == RELEASE for each in self.suspects)
 
     @property
     def reason(self) -> Reason:

@@ -74,8 +74,8 @@ def with_mistake(problem: Problem, result: Identification) -> Identification:
         if step and step.unused and fits_each_side(problem, problem.sets[step.set], step.stamp_ns):
             return result
         found = diagnose(problem)
-    if found is None:
-        return result
+    if found is None or (step and step.held and len(step.owners) > 1 and found.of_frames):
+        return result  # the step names all of them
     if result.refusals or found.alone:
         follow = (Rule.MISTAKE, Rule.REGION)
         others = (each for each in result.refusals if each.rule not in follow)

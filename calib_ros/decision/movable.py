@@ -48,8 +48,9 @@ def groups_of(problem: Problem) -> list[Moving]:
             names = parameters_of(frame)[: 3 if socket else 6]
             held = problem.model.frame(frame).fixed
             found.append(Moving((frame,), kind, names, tuple(sets), held))
-        if kind == 'base' and len(found) > 1:  # the robot's foot
-            found.append(_together(found))
+        alike = [g for g in found if g.kind == kind and (kind == 'base' or g.held)]
+        if len(alike) > 1:  # the robot's foot, or what the chain file says of all tools
+            found.append(_together(alike))
     joints, everywhere = problem.chain.joints, tuple(range(len(problem.sets)))
     found += [Moving((each.name,), 'joint', (each.driven,), everywhere) for each in joints]
     wires: dict[str, list[int]] = {}

@@ -16,9 +16,10 @@ from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
 from calib_ros.kinematics import se3
 
-pytestmark = pytest.mark.usefixtures('unsearched')
+unsearched = pytest.mark.usefixtures('unsearched')
 
 
+@unsearched
 def test_a_base_held_in_a_wrong_place_is_no_step(rng):
     true = fits.arm(rng)
     seen = measure(true, UR10E.random_joints(60, rng), rng, *NOISE)
@@ -30,6 +31,7 @@ def test_a_base_held_in_a_wrong_place_is_no_step(rng):
     assert 'the base held by the chain file is off by' in result.refusals[0]
 
 
+@unsearched
 @pytest.mark.parametrize(('held', 'in_turn'), [((0, 1, 2, 3), False), ((1, 3), True)])
 def test_bases_of_sessions_held_in_wrong_places_are_no_drift(held, in_turn):
     """One after another they follow slow waves: a correction 1 mm off was accepted."""
@@ -78,3 +80,24 @@ def test_a_held_base_of_the_last_session_did_not_move_within_it():
     assert step.held
     assert step.owners == names[2:]
     assert 'left held by the chain file is off by' in str(step)
+
+
+@pytest.mark.parametrize('kind', ['base', 'tool'])
+@pytest.mark.parametrize('count', [1, 3])
+def test_frames_by_name_held_centimetres_off_are_all_named(kind, count):
+    """Another robot was named, which fits no better."""
+    rng = np.random.default_rng(0)
+    true, chain, sets = fits.arm(rng), replace(UR10E, base=None, tool=None), []
+    names = [f'{kind}_{k}' for k in range(3)]
+    for k, name in enumerate(names):
+        seen = measure(true, UR10E.random_joints(24, rng), rng, *NOISE)
+        sets.append(replace(seen.at((24 * k + np.arange(24)) * 10**9), **{kind: name}))
+        wrong = true.frame(kind).matrix.copy()
+        wrong[:3, 3] += [0.0, 0.03, 0.04]
+        if k < count:
+            chain = chain.with_frame(name, replace(true.frame(kind), matrix=wrong, fixed=True))
+    result = identify(Problem(chain, sets[0], more=sets[1:], **SIGMAS))
+    told = 'in the measurements with {0} alone, the chain file gives a wrong {0} (fixed: true): '
+    if count > 1:
+        told = f'the {", ".join(names)} held by the chain file are off by 50 mm: '
+    assert result.refusals[0].startswith(told.format(names[0]))

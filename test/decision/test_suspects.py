@@ -230,11 +230,12 @@ def test_ways_to_write_a_pose_are_undone_in_the_poses_as_measured(what, written,
 def test_another_robot_stands_where_the_given_one_is_said_to(rng):
     """And carries its target; nothing else is told of frames that are given."""
     base, tool = (Frame(random_frame(rng, 1.0).matrix, fixed=True) for _ in range(2))
-    arm = replace(load_chain('ur10e'), base=base, tool=tool)
+    arm = replace(load_chain('ur10e'), base=base, tool=tool, frames=(('base_2', base),))
     seen = measure(arm, arm.random_joints(9, rng), rng)
     others = [each.chain for each in suspects(arm, (seen,)) if each.what.startswith('the arm is')]
     assert len(others) > 3
     assert all((each.base, each.tool) == (base, tool) for each in others)
+    assert all(each.frame('base_2') == base for each in others)
 
 
 def test_a_mirror_turns_one_axis_round_and_nothing_else(rng):
