@@ -272,7 +272,7 @@ def test_without_pandas_that_is_said(monkeypatch):
     ],
 )
 def test_numbers_have_the_digits_that_a_reader_needs(value, text):
-    assert rounded(value) == text
+    assert rounded(value) == rounded(np.float64(value)) == text
     assert rounded(-value).lstrip('-') == text
     assert interval_mm(value, value) == f'{text} to {text}'
 

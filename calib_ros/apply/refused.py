@@ -13,6 +13,7 @@ from calib_ros.apply.compensator import Compensation, Compensator, Refusal
 from calib_ros.kinematics.limits import a_turn_away
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import EXACT, TURN_IN_PART
+from calib_ros.shown import rounded
 
 
 def outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
@@ -27,8 +28,8 @@ def outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
         Refusal(
             k,
             f'the calibration is not valid in {share:.0f} % of the program, as here: the '
-            f'expected error by its parameters, {1e3 * errors[k]:.3f} mm, exceeds the limit of '
-            f'{1e3 * region.limit:.3f} mm; identify again with poses near it',
+            f'expected error by its parameters, {rounded(1e3 * errors[k])} mm, exceeds the limit '
+            f'of {rounded(1e3 * region.limit)} mm; identify again with poses near it',
         )
         for k in far.tolist()
     ]

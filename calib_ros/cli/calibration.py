@@ -16,7 +16,7 @@ from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, chain_text, load_chain
 from calib_ros.settings import Limits
-from calib_ros.shown import NAMED, some
+from calib_ros.shown import NAMED, rounded, some
 from calib_ros.texts import dump_json
 
 
@@ -100,9 +100,9 @@ def _export(options: argparse.Namespace, screen: Screen) -> int:
     with common.output_files(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as contents:
         contents |= {each.name: each.content for each in found}
     for each in found:
-        off = f'up to {1e3 * each.error:.3f} mm off{each.elsewhere}' if each.error else 'exact'
+        off = f'up to {rounded(1e3 * each.error)} mm off{each.elsewhere}'
         beyond = f' with what its first line says, {each.beyond}' if each.beyond else ''
-        screen.say(f'{options.out / each.name}: {off}{beyond}')
+        screen.say(f'{options.out / each.name}: {off if each.error else "exact"}{beyond}')
     known = dict(nominal.effects)
     if lost := [name for name, value in chain.effects if value != known.get(name, 0.0)]:
         held = ' --fixed "*.coupling_*"' if any('.coupling_' in name for name in known) else ''

@@ -44,12 +44,12 @@ def gain_refusals(
             f'{largest:.3g} mm (largest_error{"; less in so small a space" * tiny})',
         )
     if not gain > limit:
-        text = f'RMS {before.rms_mm:.3f} mm before, {after.rms_mm:.3f} mm after'
+        text = f'RMS {rounded(before.rms_mm)} mm before, {rounded(after.rms_mm)} mm after'
         if gain > 0.0:
             count = len(np.unique(validation.after.configurations[judged]))
             kind = 'places' if all(each.socket for each in problem.sets) else 'poses'
             chance = before.rms_mm * np.exp(-limit)
-            text += f'; with {count} {kind}, chance alone can lower it to {chance:.3f} mm'
+            text += f'; with {count} {kind}, chance alone can lower it to {rounded(chance)} mm'
         yield Reason(Rule.GAIN, f'no gain on held-out poses beyond chance ({text})')
     elif result.chance is not None and result.chance > 1.0 - CONFIDENT:
         yield Reason(
@@ -93,9 +93,9 @@ def harm_refusals(validation: Comparison, may_be_rounding: bool, helps: bool) ->
         if second.mean_mm > first.mean_mm or gain < -limit or caused:
             yield Reason(
                 Rule.GAIN_WITH_OUTLIERS,
-                f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
-                f'mm before, {second.rms_mm:.3f} mm after; mean {first.mean_mm:.3f} and '
-                f'{second.mean_mm:.3f} mm)',
+                'with the outliers the error on held-out poses got worse (RMS '
+                f'{rounded(first.rms_mm)} mm before, {rounded(second.rms_mm)} mm after; mean '
+                f'{rounded(first.mean_mm)} and {rounded(second.mean_mm)} mm)',
             )
     if may_be_rounding:
         text = 'the improvement may only come from rounded joint values that repeat in many poses'

@@ -26,7 +26,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.shown import Shown, as_frame, as_html
+from calib_ros.shown import Shown, as_frame, as_html, rounded
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -186,7 +186,8 @@ class Identification(Shown):
             for p in self.parameters
             if p.std is not None and not self.chain.owns_frame(p.name)
         ]
-        figures = f'RMS {before.rms_mm:.3f} → {after.rms_mm:.3f} mm, by {self.validated_by}'
+        sizes = f'{rounded(before.rms_mm)} → {rounded(after.rms_mm)} mm'
+        figures = f'RMS {sizes}, by {self.validated_by}'
         verdict = 'accepted' if self.accepted else 'not accepted'
         notes = (figures, *self.refusals, *self.remarks)
         return as_html(f'{self.chain.name}: {verdict}', notes, rows)

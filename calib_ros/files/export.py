@@ -39,6 +39,7 @@ from calib_ros.kinematics.effects import group_of
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.kinematics.urdf_editor import to_rpy
+from calib_ros.shown import rounded
 from calib_ros.texts import csv_text, dump_yaml, from_cell, parse_yaml, to_cell
 from calib_ros.values import SAME
 
@@ -113,7 +114,7 @@ def exports(
         error, elsewhere = distance(best, chain, region), RANDOM
         if joints is not None:
             most = 1e3 * distance(best, chain, q)
-            elsewhere = f' at the measured joint values, {most:.3f} mm{RANDOM}'
+            elsewhere = f' at the measured joint values, {rounded(most)} mm{RANDOM}'
         text = head(chain, f'{nominal.convention} {what}{of_table}', error, elsewhere)
         found.append(Export(name, text + _csv(best), error, elsewhere=elsewhere))
     return tuple(found)
@@ -257,9 +258,9 @@ def pose_matrix(pose: Mapping[str, float]) -> FloatArray:
 def head(chain: Chain, what: str, error: float, elsewhere: str = RANDOM) -> str:
     """Return the first line: a file's kind, its error [m], and the table of the chain."""
     name = re.sub(r'[^\w .-]', '_', chain.name)  # one line, one cell
-    exact = f'up to {1e3 * error:.3f} mm off the calibrated arm{elsewhere}' if error else 'exact'
+    off = f'up to {rounded(1e3 * error)} mm off the calibrated arm{elsewhere}'
     table = f'calibrated table {table_hash(chain)}'
-    return f'# {name}: {what}; metres and radians; {exact}; {table}\n'
+    return f'# {name}: {what}; metres and radians; {off if error else "exact"}; {table}\n'
 
 
 def urdf_export(name: str, urdf: str, chain: Chain, links: Mapping[str, str | None]) -> Export:

@@ -57,7 +57,7 @@ from calib_ros.kinematics.chain_file import (
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import Model, Settings
-from calib_ros.shown import Shown
+from calib_ros.shown import Shown, rounded
 
 HEAD = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
 
@@ -305,8 +305,8 @@ class Calibration(Shown):
         shift, turn = self.sigma(joints), self.sigma(joints, np.s_[3:])
         words = (
             'standard deviation of these poses: at most '
-            f'{1e3 * shift.max():.3f} mm at the target measured and '
-            f'{1e3 * turn.max():.3f} mrad'
+            f'{rounded(1e3 * shift.max())} mm at the target measured and '
+            f'{rounded(1e3 * turn.max())} mrad'
         )
         if np.sum(turn**2) <= np.sum(turned**2):
             return words, ''

@@ -39,7 +39,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
-from calib_ros.shown import Shown, as_html
+from calib_ros.shown import Shown, as_html, rounded
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -73,9 +73,9 @@ class Difference(Shown):
     def in_words(self) -> str:
         """Return the difference in words."""
         if self.same:
-            return f'unchanged within {1e3 * self.limit:.3f} mm'
+            return f'unchanged within {rounded(1e3 * self.limit)} mm'
         rms, limit = 1e3 * self.rms, 1e3 * self.limit
-        size = f'{rms:.3f} mm RMS over the joint range (at most {limit:.3f} mm)'
+        size = f'{rounded(rms)} mm RMS over the joint range (at most {rounded(limit)} mm)'
         if self.beyond > changes.FALSE_ALARM:
             return (
                 f'different by {size}: not noise, but perhaps smooth device errors or what the '

@@ -32,7 +32,7 @@ from calib_ros.report.gathered import poses_of
 from calib_ros.report.poses import Poses
 from calib_ros.report.refusals import GOOD_ARM, GOOD_HERE, Advice
 from calib_ros.settings import Settings
-from calib_ros.shown import counted, sentence, some
+from calib_ros.shown import counted, rounded, sentence, some
 
 NOT_YET = 'The robot itself is unchanged so far'
 BRING = (
@@ -363,7 +363,7 @@ def _determined(result: Identification) -> Section:
         'determined',
         'What the poses determine',
         'Expected error of positions predicted over the whole joint range: '
-        f'{sigma["median"]:.3f} mm (median), {sigma["max"]:.3f} mm (largest).',
+        f'{rounded(sigma["median"])} mm (median), {rounded(sigma["max"])} mm (largest).',
         f'Observability indices: {words.observability_in_words(result)}; the larger, the better. '
         'From the singular values of the Jacobian, in stated sigmas per metre or radian: O1 is '
         'their geometric mean divided by the square root of the number of poses, O2 the smallest '

@@ -15,7 +15,7 @@ from calib_ros.report.content import Headline, Origin, Report
 from calib_ros.report.explorer import explorer
 from calib_ros.report.poses import Poses
 from calib_ros.report.reports import NOT_YET, bring
-from calib_ros.shown import sentence
+from calib_ros.shown import rounded, sentence
 
 STAYS = 'the arm is unchanged within the uncertainty: the correction that it has stays valid'
 PREDICTED = '"Before": by the earlier calibration; "after": predicted from the other new poses.'
@@ -39,7 +39,7 @@ def update_standing(found: Recalibration) -> tuple[Headline, tuple[str, ...], st
 
 def known_to(found: Recalibration, arrow: str = '→') -> str:
     """Return how well the arm was and is known."""
-    known = f'{1e3 * found.known_before:.3f} {arrow} {1e3 * found.known_after:.3f} mm'
+    known = f'{rounded(1e3 * found.known_before)} {arrow} {rounded(1e3 * found.known_after)} mm'
     return f'{known} over the joint range (standard deviation)'
 
 

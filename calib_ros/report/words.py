@@ -172,7 +172,7 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
 
 def still_holds(updated: Recalibration, found: Judgement) -> tuple[bool, str]:
     """Return whether a calibration holds at the last stops, and why."""
-    text = f'RMS {1e3 * found.rms:.3f} mm at the last {counted(found.configurations, "pose")}'
+    text = f'RMS {rounded(1e3 * found.rms)} mm at the last {counted(found.configurations, "pose")}'
     if found.mistake:
         return False, verdict_in_words(found)
     if updated.step or updated.changed:  # poses before and after a step look like many changes
@@ -196,14 +196,14 @@ def verdict_in_words(found: Judgement) -> str:
     """Return whether a calibration holds on new measurements, and why."""
     nominal, now = found.comparison.figures
     since = f'{counted(found.configurations, "pose")} measured since'
-    text = f'RMS {1e3 * found.rms:.3f} mm (max {now.max_mm:.3f}) on {since}'
+    text = f'RMS {rounded(1e3 * found.rms)} mm (max {rounded(now.max_mm)}) on {since}'
     if found.mistake:
         return f'no verdict: {found.mistake}; {text}'
-    told = f'{text}; the nominal chain has {nominal.rms_mm:.3f} mm'
+    told = f'{text}; the nominal chain has {rounded(nominal.rms_mm)} mm'
     if found.limit is None:
         told = f'no verdict, the calibration has no former error: {told}'
         return f'{told}; judge with calib_ros verify --tolerance'
-    told += f'; the limit is {1e3 * found.limit:.3f} mm'
+    told += f'; the limit is {rounded(1e3 * found.limit)} mm'
     if found.failed:
         return f'the calibration no longer holds: {told}. Was tracker, target or robot moved?'
     if warning := reused_in_words(found.reused):

@@ -13,7 +13,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.estimate import Estimate
 from calib_ros.settings import Settings
-from calib_ros.shown import counted
+from calib_ros.shown import counted, rounded
 
 LITTLE = 0.35
 """Range [rad] of a joint over all samples that is too little: 20 degrees (or 0.035 m). A
@@ -34,7 +34,7 @@ def progress(
             apart = 'which do not fit this arm'
         told += f', {apart}: check units, clocks, sigmas and chain'
     elif estimate is not None:
-        told += f', {1e3 * estimate.sigma:.3f} mm expected, {_forecast(estimate, settings)}'
+        told += f', {rounded(1e3 * estimate.sigma)} mm expected, {_forecast(estimate, settings)}'
     still = barely_moved(chain, np.array(fitted)) if fitted else ()
     return [told, f'hardly moved so far: {", ".join(still)}' if still else '']
 
