@@ -19,8 +19,10 @@ from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.levels import CERTAIN
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
+from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.parameter import FRAME_KINDS
+from calib_ros.settings import EXCEPTION
 
 pytestmark = pytest.mark.usefixtures('unsearched')
 
@@ -241,3 +243,34 @@ def test_an_arm_does_not_make_up_for_a_frame_held_a_little_off(kind):
         text = f'if the {kind} held by the chain file may be off, remove fixed: true there'
         told += any(text in each for each in result.refusals)
     assert told >= 3
+
+
+@pytest.mark.parametrize(
+    ('sign', 'times', 'given', 'told'),
+    [
+        (-1.0, 2.5, (), True),
+        (0.0, 2.5, (), False),  # it never moved
+        (1.0, 0.5, (), False),  # the poses tell its play
+        (1.0, 2.5, ('elbow_joint.backlash',), False),  # it was stated
+    ],
+)
+def test_joints_that_come_from_one_side_are_told_with_their_play(sign, times, given, told):
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (30, 6))
+    signs[:, 2] = sign
+    signs[3, 2] = 0.0  # it stood still once
+    usual = effects.expected('elbow_joint.backlash')
+    names, square = [f'{n}.backlash' for n in UR10E.joint_names], np.eye(6)
+    square *= (times * EXCEPTION * usual) ** 2
+    problem = SimpleNamespace(
+        chain=UR10E, sets=[SimpleNamespace(approach=each) for each in (None, signs)], given=given
+    )
+    found = acceptance._one_sided(problem, SimpleNamespace(names=names, square=square))
+    size = f'{1e3 * times * EXCEPTION * usual:.2g}'
+    assert found == told * (
+        f'elbow_joint (± {size} mrad) moved to all poses from the same side, which hides play: '
+        'expected errors include as much as is likely. Approach poses from both sides to measure '
+        'it; if the same side is also used later, it does no harm: --model backlash --priors '
+        '"*.backlash=1e-6"'
+    )
+    alone = SimpleNamespace(chain=UR10E, sets=problem.sets[:1], given={})
+    assert acceptance._one_sided(alone, SimpleNamespace(names=names, square=square)) == ''
