@@ -285,3 +285,36 @@ def test_a_scale_is_told_in_ppm():
     ppm = np.array([2.5e-4])
     told = Explanation('device', (SCALE_OF_DEVICE,), 9.0, 0.0, 1.0, ppm, 0.1 * ppm)
     assert told.in_words() == 'the scale of the device by +250 ± 49 ppm (95 %)'
+
+
+def test_explanations_as_plain_values():
+    owner, names = 'elbow_joint', parameters_of('elbow_joint', ('a', 'd'))
+    sizes = np.array([1e-3, -2e-3]), np.array([1e-4, 2e-4])
+    assert changes.reasons_document([Explanation(owner, names, 9.0, 0.01, 0.7, *sizes)]) == [
+        {
+            'owner': 'elbow_joint',
+            'parameters': ['elbow_joint.a', 'elbow_joint.d'],
+            'change': [1e-3, -2e-3],
+            'sigma': [1e-4, 2e-4],
+            'chance': 0.01,
+            'share': 0.7,
+        }
+    ]
+
+
+def test_a_part_of_another_explanation_is_not_told():
+    names = parameters_of('elbow_joint', ('a', 'd', 'b'))
+
+    def of(*names):
+        size = np.ones(len(names))
+        return Explanation('elbow_joint', names, 9.0, 0.01, 0.7, 1e-3 * size, 1e-4 * size)
+
+    both, more, one = of(*names[:2]), of(*names), of(names[0])
+    told = changes.reason_in_words((more, both, one))
+    assert told == f'changed: {more.in_words()}, indistinguishable from {one.in_words()}'
+    assert changes.reason_in_words((both,)) == f'changed: {both.in_words()}'
+    several = changes.changes_in_words(((one, more), (both,)))
+    assert several == (
+        f'changed: {one.in_words()}, indistinguishable from {more.in_words()}; changed: '
+        f'{both.in_words()}'
+    )
