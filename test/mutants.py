@@ -91,12 +91,14 @@ def chosen(parts, count, seed, jobs):
     return sorted(random.Random(seed).sample(named, min(count, len(named))))
 
 
-def tried(module, names, jobs):
+def tried(module, names, jobs, further):
     """Run the tests near a module on its mutants; return the state of each by name.
 
-    Those further away run only on mutants of functions that none of those before calls.
+    Those further away run only on mutants of functions that none of those before calls, and if
+    `further` on all that lived.
     """
     left, states = names, {}
+    again = ('no tests', 'not checked', *(['survived'] if further else []))
     for tests in near(module):
         Path('mutants/mutmut-stats.json').unlink(missing_ok=True)
         config().pytest_add_cli_args_test_selection = tests
@@ -104,8 +106,11 @@ def tried(module, names, jobs):
         run.start()
         run.join()
         ended, _ = collect_source_file_mutation_data(mutant_names=left)
-        states |= {name: status_by_exit_code[code] for _, name, code in ended}
-        left = [name for name in left if states[name] in ('no tests', 'not checked')]
+        found = {name: status_by_exit_code[code] for _, name, code in ended}
+        states |= {
+            n: state for n, state in found.items() if state != 'no tests' or n not in states
+        }
+        left = [name for name in left if states[name] in again]
         if not left:
             break
     return states
@@ -120,9 +125,9 @@ def main():
     given = parser.parse_args()
     parts = given.parts or subprocess.check_output(CHANGED, text=True).split()
     pairs = chosen(parts, given.count, given.seed, given.jobs)
-    states = {}
+    states, further = {}, not all(Path(part).exists() for part in parts)
     for module, group in groupby(pairs, key=lambda pair: pair[0]):
-        states |= tried(module, [name for _, name in group], given.jobs)
+        states |= tried(module, [name for _, name in group], given.jobs, further)
     print(*(f'{name}: {state}' for name, state in states.items() if state != 'killed'), sep='\n')
     counts = Counter(states.values())
     noticed = counts['killed'] + counts['timeout']

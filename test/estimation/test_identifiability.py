@@ -91,7 +91,13 @@ def test_a_joint_that_stands_still_trades_on_the_poses_measured(rng):
     assert 'elbow_joint.theta' in result.not_excited
     assert set(result.not_excited) < set(result.gauges)
     first = 'elbow_joint stood still (or was not recorded): the poses do not determine '
-    assert any(text.startswith(first) for text in result.refusals)
+    (told,) = [text for text in result.refusals if text.startswith(first)]
+    named = {}
+    for name in result.not_excited:
+        named.setdefault(name.owner, []).append(name.kind)
+    every = [f'{owner} ({", ".join(kinds)})' for owner, kinds in named.items()]
+    assert told == first + ', '.join(every)
+    assert max(map(len, named.values())) > 1
     kept = {p.name: p.offset for p in result.parameters}
     assert all(kept[name] == 0.0 for name in result.not_excited)
     assert_trades_hold(result, q)
