@@ -10,7 +10,6 @@ import argparse
 import ast
 import os
 import random
-import re
 import shutil
 import subprocess
 import sys
@@ -35,7 +34,7 @@ def modules_of(part):
     """Return the numeric modules of a file, a folder or a pattern of names of mutants."""
     path = Path(part)
     if not path.exists():
-        path = Path(re.sub(r'\.x[_ǁ].*', '', part).replace('.', '/') + '.py')
+        path = Path(part.rpartition('.')[0].replace('.', '/') + '.py')
     found = sorted(path.glob('*.py')) if path.is_dir() else [path]
     return [str(path) for path in found if path.exists() and config().should_mutate(path)]
 
