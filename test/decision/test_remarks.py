@@ -64,6 +64,7 @@ def test_a_target_that_is_loose_on_the_flange_is_told(slack, gross, targets, tol
     [
         ({'by_scale': 0.15}, 'grow alike, by 0.2 %, as if'),
         ({'by_scale': 0.15, 'scale': -2e-3}, 'shrink alike, by 0.2 %, as if'),
+        ({'by_scale': 0.15, 'strain': 'in one direction'}, 'in one direction'),
         ({'by_scale': 0.14}, ''),
         ({'odds': 9.0}, ''),  # most likely, but harmless
         ({'by_scale': 0.15, 'sigma_scale': 1e-5}, 'grow alike, by 0.2 %, more than sigma_scale'),
@@ -74,9 +75,10 @@ def test_a_target_that_is_loose_on_the_flange_is_told(slack, gross, targets, tol
 )
 def test_a_device_out_of_scale_is_told_where_it_harms_or_was_checked(change, told):
     given = {'sigma_scale': 0.0, 'refusals': (), 'by_scale': 0.0, 'odds': 0.0, 'scale': 2e-3}
-    given |= change
+    given |= {'strain': ''} | change
     result = SimpleNamespace(
         refusals=given['refusals'],
+        strain=given['strain'],
         region=SimpleNamespace(by_scale=given['by_scale']),
         posterior=SimpleNamespace(rival=(given['odds'], (), ()), scale=given['scale']),
     )
@@ -224,6 +226,7 @@ class Judged:
     remarks: tuple = ()
     coupled: bool = False
     contradiction: str = ''
+    strain: str = ''
 
 
 @pytest.mark.parametrize(
@@ -246,6 +249,9 @@ class Judged:
         ({'unseen': 'off', 'lens': 'lens'}, True, [], ['lens', 'off']),
         ({'unseen': 'off', 'given': 'mistake'}, False, ['mistake'], []),
         ({'type': 'joint_3.d', 'lens': 'lens'}, True, [], ['joint_3.d', 'lens']),
+        ({'strain': 'longer', 'board': 'board'}, True, [], ['board', 'longer']),
+        ({'strain': 'longer', 'scale': 'scale'}, True, ['scale'], []),
+        ({'strain': 'longer', 'given': 'mistake'}, False, ['mistake'], []),
     ],
 )
 def test_what_explains_a_refusal_comes_before_it(found, another, refused, remarked, monkeypatch):
@@ -269,7 +275,9 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
     given = tuple(Reason(Rule.GAIN, found[name]) for name in ('given',) if name in found)
     result = plausibility.add_remarks(
         SimpleNamespace(sets=[seen], separations=()),
-        Judged(given, ('first',), 'coupled' in found, found.get('unseen', '')),
+        Judged(
+            given, ('first',), *(found.get(name, '') for name in ('coupled', 'unseen', 'strain'))
+        ),
         another,
     )
     assert sorted(result.refusals, key=lambda each: each.rule.value) == refused
