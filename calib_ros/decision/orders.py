@@ -74,19 +74,19 @@ def in_turn(
         return None
     rows, least = np.arange(len(seen)), np.ptp(seen.joints, axis=0) / 2.0
     begins = np.flatnonzero(np.diff(seen.stops, prepend=-1))
-    blocks = _blocks(problem, arm, seen, most)
-    for turns in (rows - begins[seen.stops], *(rows % (2 + k) for k in range(SEVERAL)), blocks):
+    for way in (rows - begins[seen.stops], *(rows % (2 + k) for k in range(SEVERAL)), None):
+        turns = _blocks(problem, arm, seen, most) if way is None else way
         parts = [seen.select(turns == k) for k in range(1 + turns.max(initial=0))]
         parts = [part for part in parts if covers(part, least, 2 * IN_A_FRAME)]
-        fewest = SEVERAL if turns is blocks else 2  # of two, one moved
+        fewest = SEVERAL if way is None else 2  # of two, one moved
         if len(parts) < fewest or sum(map(len, parts)) < EXPLAINED_ROWS * len(rows):
             continue
         first = in_frames(problem, arm, (parts[0],))
         errors = [first.error, *_errors(problem, arm, parts[1:], most)]
         if max(errors) <= most:
             how = ' in turn'
-            if turns is blocks:
-                starts = (1 + np.flatnonzero(np.diff(blocks))).tolist()
+            if way is None:
+                starts = (1 + np.flatnonzero(np.diff(turns))).tolist()
                 how = f', others from {rows_in_words(starts, seen.stamps_ns)} on'
             return _named_in_turn(problem, first.chain, parts, most, how), max(errors)
     return None

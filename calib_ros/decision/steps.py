@@ -42,7 +42,7 @@ from calib_ros.estimation.fitting import SOME
 from calib_ros.estimation.gain import gain_of, inverse_root
 from calib_ros.estimation.gross_errors import SUSPICIOUS
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
-from calib_ros.estimation.levels import LEAST_ASIDE, SURE, chance_of
+from calib_ros.estimation.levels import CLEARLY, LEAST_ASIDE, SURE, chance_of
 from calib_ros.estimation.pixels import in_view
 from calib_ros.estimation.samples import gram
 from calib_ros.estimation.system import System
@@ -326,8 +326,8 @@ class _Scan:
         total, free = self._all
         return free > rank and (total - gain) / (free - rank) < found.variance
 
-    def described(self, found: _Found) -> Step:
-        """Return a step with its first sample and its effect on the poses."""
+    def described(self, found: _Found) -> Step | None:
+        """Return a step with its first sample and its effect, but no far slow motion."""
         group, problem = found.group, self._problem
         sets = [self._sets[k] for k in group.sets]
         after = [self._numbers[k] >= found.stop for k in group.sets]
@@ -355,11 +355,12 @@ class _Scan:
         later = np.concatenate(after)
         sides = (BEFORE_THAT, ~later), (FROM_THERE, later)
         most = largest_of(problem) if unit == 'm' else problem.largest_angle
+        if found.slow and size > CLEARLY * most:
+            return None  # any large errors look so where the arm moves slowly
         joints = np.concatenate([each.joints for each in sets])
         unused = [where for where, side in sides if found.stop and not weights[side].any()]
         seen, model = problem.sets[of_set], problem.model
-        frames = [] if found.stop else dict.fromkeys(Parameter(name).owner for name in group.names)
-        held = tuple(name for name in frames if model.frame(name).fixed)
+        held = tuple(n for n in group.owners if not found.stop and model.frame(n).fixed)
         return Step(
             owners=held or group.owners,
             kind=group.kind,
