@@ -47,7 +47,7 @@ def gain_refusals(
         text = f'RMS {rounded(before.rms_mm)} mm before, {rounded(after.rms_mm)} mm after'
         if gain > 0.0:
             count = len(np.unique(validation.after.configurations[judged]))
-            kind = 'places' if all(each.socket for each in problem.sets) else 'poses'
+            kind = 'locations' if all(each.socket for each in problem.sets) else 'poses'
             chance = before.rms_mm * np.exp(-limit)
             text += f'; with {count} {kind}, chance alone can lower it to {rounded(chance)} mm'
         yield Reason(Rule.GAIN, f'no gain on held-out poses beyond chance ({text})')

@@ -73,4 +73,4 @@ def leave_one_place_out(
         for side in chains
     )
     judged = Comparison(first, second, ~fitted.robust.outliers)
-    return judged, f'leaving out one of {len(places)} places at a time{judged.omitted}'
+    return judged, f'leaving out one of {len(places)} locations at a time{judged.omitted}'

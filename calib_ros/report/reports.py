@@ -193,10 +193,11 @@ def advice_of(problem: Problem, result: Identification) -> tuple[Advice, ...]:
     poses = sum(map(count_distinct, numbers))
     sigma = None if result.images else result.noise.given.get('sigma_position')
     contradicted = bool(held_out) and bool(result.surprise)
-    needless = ['images' if result.images else 'poses', *['auto'] * bool(result.verdicts)]
-    needless += ['table'] * (not problem.of_messages)
-    needless += ['wireless'] * (not any(each.of_wire for each in problem.all_sets))
-    about = words.drifts(result.noise), len(result.outliers), contradicted, tuple(needless)
+    wires = any(each.of_wire for each in problem.all_sets)
+    marks = {'auto': result.verdicts, 'table': not problem.of_messages, 'no_wires': not wires}
+    marks |= {'images': result.images, 'no_images': not result.images}
+    needless = tuple(mark for mark, holds in marks.items() if holds)
+    about = words.drifts(result.noise), len(result.outliers), contradicted, needless
     return advice(result.refusals, Situation(poses, noise, sigma, *about))
 
 

@@ -40,7 +40,7 @@ def test_sockets_find_the_arm_but_not_where_it_stands():
     assert {'joint_1.theta', 'joint_1.d'} <= gauges(result)
     assert not result.not_excited
     assert not result.weak
-    assert result.validated_by == 'leaving out one of 4 places at a time'
+    assert result.validated_by == 'leaving out one of 4 locations at a time'
 
 
 def test_noise_makes_no_gauge_freedom_look_determined():

@@ -96,7 +96,7 @@ def test_sockets_are_as_good_as_the_reference(session):
     )
     assert result.converged
     assert result.accepted == gains
-    assert gains or 'with 3 places, chance alone can lower it' in result.refusals[0]
+    assert gains or 'with 3 locations, chance alone can lower it' in result.refusals[0]
     validation = result.validation
     last = validation.after.configurations == validation.after.configurations.max()
     assert validation.after.figures(last).rms_mm < 1.02 * reference

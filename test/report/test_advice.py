@@ -125,6 +125,21 @@ def test_what_moved_is_told_with_the_steps_of_what_was_measured():
     assert not any('images' in each or 'wire' in each for each in told.steps)
 
 
+@pytest.mark.parametrize(
+    ('needless', 'told', 'silent'),
+    [
+        (('no_images', 'no_wires'), 'the column session', ('--places', 'draw-wire')),
+        (('images', 'no_wires'), 'of --places', ('session', 'draw-wire')),
+        (('no_images',), 'draw-wire', ('--places',)),
+    ],
+)
+def test_what_to_do_after_a_move_suits_the_measurements(needless, told, silent):
+    reason = Reason(Rule.MOVED, 'the target moved')
+    (one,) = advice.advice([reason], advice.Situation(needless=needless))
+    assert told in ' '.join(one.steps)
+    assert not any(word in ' '.join(one.steps) for word in silent)
+
+
 @pytest.mark.parametrize('poses', [14, 50])
 def test_a_device_finer_than_stated_is_to_be_stated_first(poses):
     """The stated sigma may alone make a correction uncertain that held-out poses confirm."""
