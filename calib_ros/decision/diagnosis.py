@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib_ros.decision.moved import RELEASE
 from calib_ros.decision.reasons import Reason, Rule
-from calib_ros.decision.suspects import ORIENTATIONS
+from calib_ros.decision.suspects import ORIENTATIONS, UNHOLD
 from calib_ros.decision.undoing import Suspect
 from calib_ros.shown import rounded
 
@@ -30,13 +29,17 @@ class Diagnosis:
     @property
     def alone(self) -> bool:
         """Tell whether this refuses a result by itself."""
-        other = ORIENTATIONS.what
-        return all(each.rank and not each.chain and each.what != other for each in self.suspects)
+        return all(
+            each.rank
+            and (not each.chain or each.remedy == UNHOLD)
+            and each.what != ORIENTATIONS.what
+            for each in self.suspects
+        )
 
     @property
     def of_frames(self) -> bool:
         """Tell whether the chain file only holds frames in wrong places."""
-        return all(each.remedy == RELEASE for each in self.suspects)
+        return all(each.remedy == UNHOLD for each in self.suspects)
 
     @property
     def reason(self) -> Reason:

@@ -55,6 +55,7 @@ ON_FLANGE = (
 NOT_ON_FLANGE = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
 
 
+UNHOLD = f'{RELEASE}; if it is right, raise largest_error'
 ORIENTATIONS = Suspect(
     'the positions fit the arm, the orientations do not',
     'check their convention, their units and their columns, or leave them out',
@@ -396,4 +397,4 @@ def _of_frames(chain: Chain, sets: Sets) -> Iterator[Suspect]:
         what = f'the chain file gives a wrong {" and ".join(names)} (fixed: true)'
         (_, base), (_, tool), *others = (frames | dict.fromkeys(names)).items()
         arm = replace(chain, base=base, tool=tool, frames=tuple(others))
-        yield Suspect(what, RELEASE, rank=3, chain=arm, published=RELEASE)
+        yield Suspect(what, UNHOLD, rank=3, chain=arm, published=UNHOLD)

@@ -50,6 +50,7 @@ def test_bases_of_sessions_held_in_wrong_places_are_no_drift(held, in_turn):
     assert refused.startswith(f'the {bases} held by the chain file are off by')
 
 
+@unsearched
 def test_a_held_base_is_off_by_what_shows_not_along_what_the_tool_makes_up_for(rng):
     """Axes of a SCARA are parallel but for errors: some mm were told as 440, mostly of height."""
     first, elbow, quill, spindle = SCARA.joints
@@ -101,3 +102,16 @@ def test_frames_by_name_held_centimetres_off_are_all_named(kind, count):
     if count > 1:
         told = f'the {", ".join(names)} held by the chain file are off by 50 mm: '
     assert result.refusals[0].startswith(told.format(names[0]))
+
+
+@pytest.mark.parametrize(('far', 'refused'), [(0.02, True), (0.0, False)])
+def test_a_tool_held_far_off_along_the_last_axis_is_refused(rng, far, refused):
+    """The last row of the table made up for it: accepted with d 20 mm off, and a remark."""
+    true = fits.arm(rng)
+    seen = measure(true, UR10E.random_joints(60, rng), rng, *NOISE)
+    wrong = true.tool.matrix.copy()
+    wrong[2, 3] += far
+    held = replace(true.tool, matrix=wrong, fixed=True)
+    result = identify(Problem(replace(UR10E, tool=held), seen, **SIGMAS))
+    assert ('gives a wrong tool' in ''.join(result.refusals)) == refused
+    assert result.accepted != refused
