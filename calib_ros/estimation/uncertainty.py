@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.shown import Shown
 
 
@@ -29,8 +29,13 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
     if middle is None:
         return np.asarray(inverse @ inverse.T)
     root, order, rank, _ = lapack.dpstrf(turned, lower=1)  # pivoted
+    root = np.tril(root)
     root[:, rank:] = 0.0  # no rounding below zero
-    root = inverse[:, order - 1] @ np.tril(root)
+    if np.isclose((root**2).sum(), np.trace(turned), rtol=HALF_THE_DIGITS, atol=0.0):
+        root = inverse[:, order - 1] @ root
+    else:  # thinned pairs of neighbours estimate a middle that is not positive
+        sizes, axes = np.linalg.eigh(turned)
+        root = inverse @ (axes * np.sqrt(np.maximum(sizes, 0.0)))
     return np.asarray(root @ root.T)
 
 

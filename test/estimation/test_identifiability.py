@@ -223,6 +223,12 @@ def test_the_covariance_of_a_factor_by_hand():
     some = factor[1:].T @ factor[1:]  # as of a part that shows some parameters only
     inverse = np.linalg.inv(normal)
     np.testing.assert_allclose(covariance(factor, some), inverse @ some @ inverse, rtol=1e-12)
+    # an estimate from a part of all pairs may have directions below zero
+    axes = np.linalg.qr(np.random.default_rng(1).normal(size=normal.shape))[0]
+    sizes = np.linspace(-0.5, 9.0, len(normal))
+    middle = factor.T @ (axes * sizes) @ axes.T @ factor
+    root = np.linalg.solve(factor, axes * np.sqrt(np.maximum(sizes, 0.0)))
+    np.testing.assert_allclose(covariance(factor, middle), root @ root.T, rtol=1e-9)
     with pytest.raises(np.linalg.LinAlgError):  # not the certainty of zeros
         covariance(factor, np.full_like(normal, np.nan))
 
