@@ -36,6 +36,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg, special
 
+from calib_ros.estimation.considered import travels
 from calib_ros.estimation.gain import inverse_root
 from calib_ros.estimation.gauges import best_imitation
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SCALE, SEVERAL, chance_of
@@ -251,13 +252,11 @@ def likelier(
     best = max(tried, key=likely)
     if best is given:
         return changed
-    owners = [names[0].owner if len(names) == 1 else 'all joints' for names in best]
-    pairs = [*zip(owners, best, strict=True)]
+    pairs = [(own[0].owner if len(own) == 1 else 'all joints', own) for own in best]
     rough = [(_explanation(information, columns, freedom, *pair),) for pair in pairs]
     found: list[tuple[Explanation, ...]] = []
-    for reasons, pair in zip(rough, pairs, strict=True):
-        others = columns.spread([each for each in rough if each is not reasons])
-        alone = information.marginalised(others)
+    for k, pair in enumerate(pairs):
+        alone = information.marginalised(columns.spread([*rough[:k], *rough[k + 1 :]]))
         found.append((_explanation(alone, columns, freedom, *pair),))
     return found
 
@@ -267,7 +266,7 @@ class ChangeColumns:
 
     Changes of others show in these if they are gauge freedoms beside them, otherwise not at all.
     `frames` may have moved; others are free and absorb what they can. `scaled` allows another
-    scale of the device.
+    scale of the device, with linear joints only if their travel is among the names.
     """
 
     def __init__(
@@ -301,9 +300,10 @@ class ChangeColumns:
         load = f'gravity_{chain.joint_names[-1]}'
         if carried := tuple(name for name in names if name.kind == load):
             sets.append((LOAD, carried))
-        lengths = [name for name in self._columns if name.is_length]
-        if scaled and lengths:
-            grown = [chain.value(name) * self._columns[name] for name in lengths]
+        grows = {name: chain.value(name) for name in self._columns if name.is_length}
+        grows |= dict.fromkeys(travels(chain), 1.0)
+        if scaled and grows and grows.keys() <= self._columns.keys():
+            grown = [size * self._columns[name] for name, size in grows.items()]
             self._columns[SCALE_OF_DEVICE] = np.sum(grown, axis=0)
             sets.append((SCALE_OF_DEVICE.owner, (SCALE_OF_DEVICE,)))
         self.sets = tuple(sets)

@@ -195,13 +195,9 @@ def _rms_positions(arm: _Arm, before: FloatArray, found: _Found) -> tuple[float,
 
 
 def _may_be_scaled(chain: Chain, sets: Sequence[Observations]) -> bool:
-    """Tell whether one device measured all, with a scale that positions would show.
-
-    No parameter stretches the travel of prismatic joints.
-    """
+    """Tell whether one device measured all, with a scale that positions would show."""
     base, *others = {each.base for each in sets}
-    linear = any(joint.type != 'revolute' for joint in chain.joints)
-    if others or linear or chain.frame(base).fixed:
+    if others or chain.frame(base).fixed:
         return False
     return all(
         each.distances is None and each.points is None and not (each.socket or each.inverse)

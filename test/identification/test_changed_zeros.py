@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Several or all joint zeros have changed at once, frames, or the load; few poses tell."""
+"""Several or all joint zeros have changed at once, frames, load or scale; few poses tell."""
 
 from dataclasses import replace
 
@@ -287,3 +287,19 @@ def test_heights_on_a_scara_are_told_from_each_other(seed):
         now = replace(true, **{name: elsewhere[name] for name in new})
         found = recalibrate(previous, seen(now, 8), 0.1, new=new)
         assert (found.accepted, found.changed) == (True, ())
+
+
+def test_the_travel_of_a_linear_joint_grows_with_the_scale():
+    """All lengths of a SCARA grow alike, seen by the device from another place."""
+    rng = np.random.default_rng(4)
+    true = faulty(SCARA, Cell(), rng)
+    nominal = replace(SCARA, base=None, tool=None)
+    first = measure(true, SCARA.random_joints(60, rng), rng, *NOISE)
+    previous = Calibration.of(identify(Problem(nominal, first, **SIGMAS)))
+    now = replace(true, base=random_frame(rng, 2.0))
+    again = measure(now, SCARA.random_joints(20, rng), rng, *NOISE)
+    for scale in (1.0, 1.0006):
+        seen = replace(again, positions=scale * again.positions)
+        found = recalibrate(previous, Problem(nominal, seen, **SIGMAS), 0.1, new=('base',))
+        assert found.accepted is (scale == 1.0)
+        assert found.out_of_scale is (scale != 1.0)

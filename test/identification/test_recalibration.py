@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SCARA, SIGMAS, UR10E, arm, measured_arm, problem, rms
+from fits import NOISE, SIGMAS, UR10E, arm, measured_arm, problem, rms
 from robots import DATA, needs_data
 
 from calib_ros import Calibration, Problem, identify, load_chain, read_table, recalibrate
@@ -382,13 +382,12 @@ def test_another_of_several_targets_may_be_new(earlier):
 
 
 def test_one_device_that_sees_all_lengths_may_be_out_of_scale():
-    """Not one of several, nor a held one; and nothing stretches the travel of a linear joint."""
+    """Not one of several, nor a held one."""
     seen = problem(UR10E, 4, 0).observations
     size, pair = np.ones(4), (seen, replace(seen, base='base_2'))
     assert _may_be_scaled(UR10E, (seen, seen))
     for chain, sets in (
         (UR10E.with_frame('base', Frame(fixed=True)), (seen,)),
-        (SCARA, (seen,)),
         (UR10E.with_frame('base_2', Frame()), pair),
         *((UR10E, (replace(seen, **more),)) for more in ({'distances': size}, {'socket': True})),
     ):
