@@ -262,7 +262,7 @@ def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:
 def _of_joints(chain: Chain) -> Iterator[Suspect]:
     """Yield signs, zeros, order and couplings of joints."""
     names = chain.joint_names
-    same = np.eye(len(names))
+    last, same = len(names), np.eye(len(names))
     revolute = [joint.type == 'revolute' for joint in chain.joints]
     for k in range(len(names)):
         yield from _of_joint(chain, k)
@@ -274,18 +274,19 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
         published = 'swap them in joint_names, start without resume'
         change = (joint_map(same[order]),)
         yield Suspect(what, remedy, change, 2, published=published, part='order')
-    last = len(names)
     orders = {'in the order from tool to base': [*range(last)][::-1]} if last > 3 else {}
     for more in (1, 2) if last > 6 else ():  # external axes, which controllers name last
         where = f'in another order, {" and ".join(names[:more])} last'
         orders[where] = [*range(last - more, last), *range(last - more)]
     for where, places in orders.items():
         yield replace(reordered(f'the joints are {where}', places, rank=2), part='order')
-    ends = ((0, 'device moves'), (len(names) - 1, 'target does not move'))
-    for k, stands in ends:
-        what, remedy = f'the {stands} with {names[k]}', 'leave this joint out of the chain file'
-        still = joint_map(same - np.outer(same[k], same[k]))
-        yield Suspect(what, f'{remedy}, or --columns q{k + 1}=0', (still,), published=remedy)
+    tails = (('target does not move', slice(k, last)) for k in range(last - 1, 0, -1))
+    for stands, which in (('device moves', slice(1)), *tails):
+        listed = ', '.join(names[which])
+        what, remedy = f'the {stands} with {listed}', f'leave {listed} out of the chain file'
+        columns = ','.join(f'q{k + 1}=0' for k in range(last)[which])
+        still = joint_map(same - np.diag(same[which].sum(axis=0)))
+        yield Suspect(what, f'{remedy}, or --columns {columns}', (still,), published=remedy)
     for k in range(1, len(names)):
         for way in '+-' if revolute[k] and revolute[k - 1] else '':
             coupled = same + float(f'{way}1') * np.outer(same[k], same[k - 1])

@@ -58,8 +58,9 @@ def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
     seen = measure(held, rail.random_joints(20, rng), rng)
     found = {each.what: (each.rank, each.part) for each in suspects(held, (seen,))}
     assert {what: found.get(what) for what in RANKS} == RANKS
-    ends = [e.remedy for e in suspects(held, (seen,)) if 'leave this joint out' in e.remedy]
-    assert [each.split()[-1] for each in ends] == ['q1=0', 'q7=0']  # of the seven columns
+    ends = [e.remedy for e in suspects(held, (seen,)) if e.remedy.startswith('leave ')]
+    tails = [','.join(f'q{k}=0' for k in range(first, 8)) for first in range(7, 1, -1)]
+    assert [each.split()[-1] for each in ends] == ['q1=0', *tails]  # of the seven columns
     assert 'the coordinates x, y, z of the positions are -x, -y, -z' not in found  # left-handed
     assert 'the lengths of the chain file are in mm, not metres' not in found  # shorter than 0.1 m
     assert (
@@ -69,6 +70,19 @@ def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
     others = [e for e in suspects(sister, (seen.select(np.arange(0)),)) if 'arm is a' in e.what]
     assert {each.rank for each in others} == {2}
     assert 'ur10e' in {each.chain.name for each in others}
+
+
+@pytest.mark.parametrize('oriented', [False, True])
+def test_a_target_that_the_last_joints_do_not_move_is_named(rng, oriented):
+    """It was said that joints 4, 5 and 6 were in degrees, or nothing but a large error."""
+    nominal = load_chain('staubli_tx90l')
+    true = faulty(nominal, Cell(), rng)
+    joints = nominal.random_joints(40, rng)
+    on_forearm = np.where(np.arange(6) < 3, joints, 0.0)
+    seen = measure(true, on_forearm, rng, 5e-5, 2e-4, oriented).changed(joints=joints)
+    last = ', '.join(nominal.joint_names[3:])
+    named = f'does not move with {last}: leave {last} out of the chain file, or --columns q4=0,'
+    assert named in identify(Problem(nominal, seen)).refusals[0]
 
 
 @pytest.mark.parametrize('robot', ['staubli_tx90l', 'franka_panda'])
