@@ -212,3 +212,8 @@ def test_poses_in_one_spot_do_not_show_a_good_arm():
     problem = Problem(UR, rows, sigma_position=1e-4, sigma_orientation=4e-4)
     (told,) = report_of(problem, identify(problem)).advice
     assert told == replace(refusals.GOOD_HERE, refusal=told.refusal)
+
+
+def test_of_a_far_larger_arm_the_setting_of_its_lengths_is_named():
+    """An arm of 20 m, right but for 6 cm, was only taken for another."""
+    assert '--largest-length' in refusals.rules()[Rule.COMMON_SENSE].steps[-1]
