@@ -12,12 +12,23 @@ import numpy as np
 
 from calib_ros.decision.lost_rows import EXPLAINED_ROWS, FEWEST_ROWS, MOST_SEARCHED, covers
 from calib_ros.decision.suspects import reordered
-from calib_ros.decision.trials import in_frames, sample_errors
+from calib_ros.decision.trials import Trial, in_frames, sample_errors
 from calib_ros.decision.undoing import Sets, Suspect
-from calib_ros.estimation.levels import CLEARLY, LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
+from calib_ros.estimation.leastsquares import minimise
+from calib_ros.estimation.levels import (
+    ALIKE,
+    CLEARLY,
+    LEAST_ASIDE,
+    NEARER,
+    SEVERAL,
+    TELLING,
+    TRIED,
+)
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.start import flange
+from calib_ros.estimation.system import System
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import ROUNDING, Index
@@ -82,14 +93,37 @@ def in_turn(
         if len(parts) < fewest or sum(map(len, parts)) < EXPLAINED_ROWS * len(rows):
             continue
         first = in_frames(problem, arm, (parts[0],))
-        errors = [first.error, *_errors(problem, arm, parts[1:], most)]
+        errors, how = [first.error, *_errors(problem, arm, parts[1:], most)], ' in turn'
+        if way is None and first.error <= most:
+            starts = (1 + np.flatnonzero(np.diff(turns))).tolist()
+            lines = rows_in_words(starts, seen.stamps_ns)
+            slip = _slipped(problem, first, parts, lines)
+            if slip[1] <= min(most, ALIKE * max(errors)):
+                return slip
+            how = f', others from {lines} on'
         if max(errors) <= most:
-            how = ' in turn'
-            if way is None:
-                starts = (1 + np.flatnonzero(np.diff(turns))).tolist()
-                how = f', others from {rows_in_words(starts, seen.stamps_ns)} on'
             return _named_in_turn(problem, first.chain, parts, most, how), max(errors)
     return None
+
+
+def _slipped(
+    problem: Problem, first: Trial, parts: Sequence[Observations], lines: str
+) -> tuple[Suspect, float]:
+    """Return the joint whose zero explains most in later parts, and the largest error [m]."""
+    arm, least = first.chain, (np.inf, '')
+    for name in (parts[0].base, parts[0].tool):
+        arm = arm.with_frame(name, replace(arm.frame(name), fixed=True))
+    for joint in arm.joints:
+        found = []
+        for part in parts[1:]:
+            system = System((Samples(part, problem.sigma_position, problem.sigma_orientation),))
+            chain = minimise(arm, [joint.driven], system, tolerance=1e-2, iterations=12).chain
+            found.append(Trial(chain, (part,), (flange(chain, part),)).error)
+        least = min(least, (max(found), joint.name))
+    what, remedy = f'the zero of {least[1]} moved before {lines}', 'check its mastering'
+    again = f'{remedy}, and measure again (after ~/clear)'
+    remedy += '; measure again, or give only the rows between two of these'
+    return Suspect(what, remedy, published=again), least[0]
 
 
 def _blocks(problem: Problem, arm: Chain, seen: Observations, most: float) -> Index:

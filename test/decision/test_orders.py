@@ -133,6 +133,16 @@ def test_targets_one_after_the_other_are_named_also_if_the_first_is_held(count, 
     assert str(found).startswith(what)
 
 
+@pytest.mark.parametrize(('joint', 'oriented'), [(0, True), (0, False), (5, True)])
+def test_a_joint_that_slips_twice_is_not_several_devices_or_targets(joint, oriented):
+    """The first turns the base, the last one the tool."""
+    _, _, seen = measured_arm(2, 60, oriented=oriented)
+    slips = np.arange(60)[:, np.newaxis] // 20 * 0.1 * np.eye(6)[joint]
+    found = diagnose(Problem(UR10E, replace(seen, joints=seen.joints + slips)))
+    what = f'the zero of {UR10E.joint_names[joint]} moved before lines 21, 41: check its mastering'
+    assert str(found).startswith(what)
+
+
 @pytest.mark.parametrize('name', ['base_left', 'tool_left'])
 def test_a_frame_of_a_named_device_or_target_held_in_a_wrong_place_is_not_several(name):
     """Each half of the rows fits in frames of its own, but so do all of them."""
