@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Position errors on held-out measurements of real robots, by model.
 
-    CALIB_ROS_DATA=FOLDER python benchmarks/real_robots.py [--json]
+    CALIB_ROS_DATA=FOLDER python benchmarks/real_robots.py [--near] [--json]
 
 Rows: the nominal chain with its frames fitted, the geometric model (default settings; `plain` is
 without the robust loss, as the reference was made), the geometric model with each group of
@@ -26,6 +26,7 @@ from pathlib import Path
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
+from cell_simulator import misfit, rms
 from scipy import linalg
 from scipy.spatial.distance import cdist
 
@@ -56,6 +57,8 @@ PUBLISHED = {
     ('mukca_sockets', 'panda_1'): (7.79, 0.347, 'other places fitted and judged'),
 }
 UR10 = 'ur10_ipa_leica'
+NEAR, FEW = 40, 12
+"""Sets of near poses of each robot, and rows that are too few to judge by."""
 
 
 def problem_of(name, session, chain_name):
@@ -191,11 +194,53 @@ def process(q, errors, unseen):
     return predicted(unseen, *best, np.ones(len(q), dtype=bool))
 
 
+def near_one_pose(seen, rng):
+    """Return some observations near one, and all others."""
+    place = (seen.joints, seen.positions)[rng.integers(2)]
+    apart = np.linalg.norm(place - place[rng.integers(len(seen))], axis=1)
+    order, count = np.argsort(apart), rng.integers(12, 41)
+    return seen.select(np.sort(order[:count])), seen.select(np.sort(order[count:]))
+
+
+def worse_in_region(result, rest):
+    """Return whether a calibration is worse than before on other rows in its region, if known."""
+    inside = rest.select(result.region.covers(rest.joints))
+    if len(inside) < FEW:
+        return None
+    poses = [each.forward(inside.joints) for each in (result.before, result.chain)]
+    before, after = (misfit(inside.positions, p[:, :3, :3], p[:, :3, 3]) for p in poses)
+    good = np.maximum(before, after) < 8.0 * np.median(after)  # without gross errors
+    return bool(rms(after[good]) > 1.05 * rms(before[good]))
+
+
+def near_poses():
+    """Print by data set how many calibrations from near poses make the arm worse."""
+    for name, session, chain_name in SETS:
+        if name in ('positioner_2axis_pose', 'mukca_sockets'):
+            continue
+        problem, rng = problem_of(name, session, chain_name), np.random.default_rng(0)
+        verdicts = []
+        for _ in range(NEAR):
+            near, rest = near_one_pose(problem.observations, rng)
+            result = identify(replace(problem, observations=near, held_out=None))
+            if result.accepted:
+                verdicts.append(worse_in_region(result, rest))
+        judged = [each for each in verdicts if each is not None]
+        print(
+            f'{name} {session}: accepted {len(verdicts)} of {NEAR}, judged {len(judged)}, '
+            f'worse {sum(judged)}'
+        )
+
+
 def main():
     """Run all sets and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--json', action='store_true')
+    parser.add_argument('--near', action='store_true', help='only from near poses')
     options = parser.parse_args()
+    if options.near:
+        near_poses()
+        return
     found = {}
     for (name, session, chain_name), reference in SETS.items():
         lines = list(rows_of(problem_of(name, session, chain_name)))

@@ -28,7 +28,7 @@ from calib_ros.estimation.joint_errors import (
     turns_and_tilts,
     wobble_columns,
 )
-from calib_ros.estimation.levels import KNOWN
+from calib_ros.estimation.levels import ALIKE, KNOWN
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.posterior import MixtureTerm, Posterior
 from calib_ros.estimation.samples import gram
@@ -42,12 +42,17 @@ SHELL = SOME_POSES // 20  # random configurations per shell
 
 
 def region_of(
-    posterior: Posterior, sets: Sequence[Observations], freedom: float, largest: float
+    posterior: Posterior,
+    sets: Sequence[Observations],
+    freedom: float,
+    largest: float,
+    incomplete: bool = False,
 ) -> Region | None:
     """Return where a calibration may be used; None if not even at the measured poses.
 
     `freedom` are the degrees of freedom of the noise estimate; away from the measured poses the
-    expected error is `largest` [m] at most.
+    expected error is `largest` [m] at most. If the model is `incomplete`, it is not clearly larger
+    there than the correction at the measured poses either (benchmarks/real_robots.py).
     """
     ends = sets[0].base, sets[0].tool
     measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
@@ -65,6 +70,8 @@ def region_of(
     mixture = judge.of_the_arm(posterior.mixture)
     if not max(judge.risk(own, own, mixture), judge.risk(inner, inner, mixture)) < RISK:
         return None
+    if incomplete:
+        largest = min(largest, ALIKE * judge.correction(own) / np.sqrt(len(measured)))
     shells = order[~inside & (far[order] <= largest)]
     for shell in np.split(shells, range(SHELL, len(shells), SHELL)):
         added = judge.products(rows[..., shell])
@@ -120,13 +127,13 @@ class _Judge:
         own = np.array([each[arm] for each in covariances])
         return np.array(weights), np.array(means)[:, self._arm], own
 
+    def correction(self, which: FloatArray) -> float:
+        """Return the root of the sum of squares [m] of the correction at some poses."""
+        return float(np.sqrt(np.maximum(self._slope(which, which) @ self._offsets, 0.0)))
+
     def risk(self, which: FloatArray, around: FloatArray, mixture: _Mixture) -> float:
         """Return the risk at some poses, in frames fitted to poses around; by their products."""
-        frames, arm = np.s_[: self._placed], np.s_[self._placed :]
-        root = inverse_root(around[frames, frames], np.diag(around)[frames])
-        placed = -root @ (root.T @ (around[frames, arm] @ self._offsets))
-        pushed = which @ np.append(placed, self._offsets)
-        slope = pushed[arm] - around[arm, frames] @ (root @ (root.T @ pushed[frames]))
+        slope = self._slope(which, around)
         gain = float(slope @ self._offsets)
         weights, means, covariances = mixture
         margins = means @ slope - 0.5 * gain
@@ -135,3 +142,11 @@ class _Judge:
         with np.errstate(divide='ignore', invalid='ignore'):
             risks = special.stdtr(min(self._freedom, KNOWN), -margins / spreads)
         return float(weights @ np.where(spreads > 0.0, risks, margins <= 0.0))
+
+    def _slope(self, which: FloatArray, around: FloatArray) -> FloatArray:
+        """Return the products (A,) of the correction at some poses with the arm's columns."""
+        frames, arm = np.s_[: self._placed], np.s_[self._placed :]
+        root = inverse_root(around[frames, frames], np.diag(around)[frames])
+        placed = -root @ (root.T @ (around[frames, arm] @ self._offsets))
+        pushed = which @ np.append(placed, self._offsets)
+        return np.asarray(pushed[arm] - around[arm, frames] @ (root @ (root.T @ pushed[frames])))

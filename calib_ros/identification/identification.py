@@ -35,6 +35,7 @@ from calib_ros.estimation.considered import considered
 from calib_ros.estimation.evidence import Inference
 from calib_ros.estimation.fitted import Fitted, ParameterRow, SimplerFit, parameter_rows
 from calib_ros.estimation.fitting import SOME, fit
+from calib_ros.estimation.gross_errors import SUSPICIOUS
 from calib_ros.estimation.leastsquares import Fit, minimise
 from calib_ros.estimation.levels import SCALE
 from calib_ros.estimation.normal import normal_equations
@@ -162,6 +163,8 @@ def _region(
     fitted, problem = inference.fitted, inference.fitted.problem
     freedom = fitted.uncertainty.overall
     of = partial(region_of, sets=problem.sets, freedom=freedom, largest=problem.largest_error)
+    if not fitted.noise.consistent and fitted.size > SUSPICIOUS:
+        of = partial(of, incomplete=True)
     region = of(posterior.widened(wider))
     printed = all(each.pixels is not None for each in problem.sets)
     finer = SCALE if printed else EXCEPTION * SCALE  # as of a tracker

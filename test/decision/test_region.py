@@ -205,10 +205,11 @@ def test_no_pose_is_covered_with_an_expected_error_that_no_result_may_have(large
     q, play = at_stations(rng, 2)[:40], 3e-4 * rng.uniform(0.0, 1.0, 6)
     turned = q + play * np.sign(np.diff(q, axis=0, prepend=q[:1] - rng.normal(size=(1, 6))))
     seen = replace(measure(UR10E, turned, rng, 2e-5, oriented=False), joints=q)
-    found = identify(Problem(UR10E, seen, sigma_position=2e-5, largest_error=largest)).region
-    assert found.covers(q).all()
+    found = identify(Problem(UR10E, seen, sigma_position=2e-5))
+    region = region_of(found.posterior, [seen], found.uncertainty.overall, largest)
+    assert region.covers(q).all()
     anywhere = UR10E.random_joints(500, rng)
-    assert (found.known(anywhere[found.covers(anywhere)]) > 0.01).any() is np.bool_(covered)
+    assert (region.known(anywhere[region.covers(anywhere)]) > 0.01).any() is np.bool_(covered)
 
 
 def test_what_a_still_joint_leaves_open_is_not_covered(local):
