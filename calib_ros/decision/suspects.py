@@ -53,8 +53,6 @@ ON_FLANGE = (
     '--eye-in-hand',
 )
 NOT_ON_FLANGE = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
-
-
 UNHOLD = f'{RELEASE}; if it is right, raise largest_error'
 ORIENTATIONS = Suspect(
     'the positions fit the arm, the orientations do not',
