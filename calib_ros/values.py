@@ -92,7 +92,7 @@ def parse_mapping(
             f'{where} must be a mapping with the keys {", ".join(keys)}, not {found}'
         )
     for key in value:
-        if type(key) in (int, float):  # {a: 0,5}
+        if value[key] is None and str(key).isdigit():  # {a: 0,5}; 089 is a text
             raise ConfigError(f'{where}: a number has no key: write 0.5, not 0,5')
         if key not in keys:
             raise UnknownNameError(f'{where}: key', str(key), keys)

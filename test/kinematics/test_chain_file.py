@@ -158,6 +158,8 @@ WRONG = [
     ('d: 0.1273', 'd: twelve', "joint 1: d must be a finite number, not 'twelve'"),
     ('d: 0.1273', 'd: pi/2', "joint 1: d must be .*, not 'pi/2': write it out, such as 1.5708"),
     ('d: 0.1273', 'd: 0,075', 'joint 1: a number has no key: write 0.5, not 0,5'),  # "key 61"
+    ('d: 0.1273', 'd: 0,089', 'joint 1: a number has no key: write 0.5, not 0,5'),
+    ('name: joint_1', '1: joint_1', 'joint 1: unknown key "1"'),
     ('joints:\n', 'joints:\n\t', 'not valid YAML: .*: indent with blanks, not tabs'),
     ('d: 0.1273', 'd: [1]', 'joint 1: d must be a finite number'),
     ('d: 0.1273', 'd: yes', 'joint 1: d must be a finite number, not True'),
