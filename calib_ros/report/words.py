@@ -209,6 +209,8 @@ def verdict_in_words(found: Judgement) -> str:
     if warning := reused_in_words(found.reused):
         return f'no verdict: {warning}: measure new ones; {text}'
     if found.verdict == 'UNDECIDED':
+        if found.noise and found.needed is None:
+            return f'the device has too much noise to tell whether the calibration holds: {told}'
         return f'too few poses to tell whether the calibration holds: {told}; measure more'
     turned = turned_in_words(now)
     return f'the calibration holds: {told}' + f'; but {turned}' * bool(turned)

@@ -88,6 +88,16 @@ def test_a_single_pose_proves_little(rms_mm, says):
     assert 'on 1 pose measured since' in verdict_in_words(found)
 
 
+def test_noise_that_no_number_of_poses_overcomes_asks_for_no_more_of_them():
+    """~/validate asked for more poses, where `verify` named the noise of the device."""
+    arm = load_chain('ur10e')
+    found = judge(Calibration(arm, arm, residual=1e-4), (), off_by(*[0.16] * 20))
+    assert verdict_in_words(replace(found, noise=1e-4)).endswith('; measure more')  # they decide
+    told = verdict_in_words(replace(found, noise=1e-4, needed=None))
+    assert told.startswith('the device has too much noise to tell')
+    assert 'measure more' not in told
+
+
 def test_a_mistake_is_named_instead_of_a_verdict():
     """As by `verify`: ~/validate said that the calibration no longer holds."""
     arm, rng = load_chain('ur10e'), np.random.default_rng(0)
