@@ -324,7 +324,9 @@ class CalibrationNode(Batched):
         calibration, problem = found
         years = years_since(calibration.record, problem.all_sets)
         updated = recalibrate(calibration, problem, years)
-        return words.still_holds(updated, judge(calibration, problem.all_sets, of_messages=True))
+        given = calibration, problem.all_sets
+        found = judge(*given, of_messages=True, sigma_position=problem.sigma_position)
+        return words.still_holds(updated, found)
 
     def _on_clear(self, request: Any) -> Answer:
         count = len(self.session.samples)

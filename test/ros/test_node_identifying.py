@@ -8,6 +8,7 @@ import threading
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters
@@ -69,6 +70,23 @@ def test_messages_are_taken_while_an_identification_runs(tmp_path, recording, he
         release.set()
         cell.spin_until(again.done)
         assert again.result().success, again.result().message
+
+
+def test_a_noisier_device_condemns_no_arm(tmp_path, recording, rng):
+    """By ~/check it no longer held, where ~/validate could not tell."""
+    noisy, parameters = pose_messages(recording.poses), {'chain': 'ur10e'}
+    for k, off in enumerate(np.repeat(rng.normal(0.0, 1e-3, STOPS), len(noisy) // STOPS)):
+        noisy[k].pose.position.x += off
+    with Cell(**parameters, data_dir=str(tmp_path)) as cell:
+        cell.play(topics(recording))
+        cell.done('identify')
+        cell.done('save')
+    for sigma, said in ((1e-4, 'no longer holds'), (1e-3, 'too much noise to tell')):
+        with Cell(**parameters, data_dir=str(tmp_path), sigma_position=sigma) as cell:
+            cell.done('load')
+            cell.play(topics(recording, measured_pose=noisy))
+            assert said in cell.refused('validate').message
+            assert cell.call('check').success == (sigma > 1e-4)
 
 
 def test_no_earlier_calibration_is_taken_for_the_one_that_is_identified(cell, recording, held):
