@@ -25,8 +25,8 @@ from mutmut.stats import status_by_exit_code
 
 CHANGED = ('git', 'diff', '--name-only', '--diff-filter=d', 'HEAD~1', '--', 'calib_ros')
 NONE = (
-    'No numeric module is given, or was changed by the last commit and since: give modules or '
-    'folders like calib_ros/kinematics, or names of mutants'
+    'No numeric module or mutant is given, or was changed by the last commit and since: give '
+    'modules or folders like calib_ros/kinematics, or names of mutants'
 )
 
 
@@ -85,7 +85,14 @@ def chosen(parts, count, seed, jobs):
     create_mutants(jobs)
     written, _ = collect_source_file_mutation_data(mutant_names=())
     every = [(Path(data.path), name) for data, name, _ in written]
-    named = [pair for pair in every if any(fnmatch(pair[1], part) for part in parts)] or every
+    whole = {module for part in parts if Path(part).exists() for module in modules_of(part)}
+    named = [
+        (module, name)
+        for module, name in every
+        if str(module) in whole or any(fnmatch(name, part) for part in parts)
+    ]
+    if not named:
+        sys.exit(NONE)
     print(f'{min(count, len(named))} of {len(named)} mutants:', *modules, flush=True)
     return sorted(random.Random(seed).sample(named, min(count, len(named))))
 
