@@ -11,11 +11,11 @@ from calib_ros.decision.reasons import Rule
 
 AGAIN = ', measure again after ~/clear'
 SIZE = 1.234e-3
-FRAME = Step('base', 'base', 'the device', 0, 4, 0, SIZE, 'm', 0.3, '', 'row 5')
-JOINT = replace(FRAME, what='elbow_joint', kind='joint', thing='the joint', unit='rad')
-LOAD = replace(FRAME, what='load', kind='load', thing='the load of the arm')
+FRAME = Step(('base',), 'base', 'the device', 0, 4, 0, SIZE, 'm', 0.3, '', 'row 5')
+JOINT = replace(FRAME, owners=('elbow_joint',), kind='joint', thing='the joint', unit='rad')
+LOAD = replace(FRAME, owners=('the load',), kind='load', thing='the load of the arm')
 WIRES = {'wire': 2e-3, 'other': -1e-3}
-ZERO = replace(FRAME, what='wire', kind='zero', thing='the device', longer=WIRES)
+ZERO = replace(FRAME, owners=('wire',), kind='zero', thing='the device', longer=WIRES)
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ ZERO = replace(FRAME, what='wire', kind='zero', thing='the device', longer=WIRES
             f'base moved by 1.2 mm before pose 7 and is outdated{AGAIN}',
         ),
         (
-            replace(FRAME, unused=BEFORE_THAT, what='base, base_b'),
+            replace(FRAME, unused=BEFORE_THAT, owners=('base', 'base_b')),
             'the device moved by 1.2 mm (base, base_b) before row 5; measurements before that '
             'carry no weight',
             'base, base_b moved by 1.2 mm before pose 7',
@@ -86,12 +86,12 @@ def test_what_moved_is_told(step, said, told):
     assert step.harmful == (AGAIN in told and not step.outdated)
 
 
-@pytest.mark.parametrize(('what', 'are'), [('tool', 'is'), ('tool, tool_b', 'are')])
-def test_a_frame_held_in_the_wrong_place_is_told(what, are):
-    reason = replace(FRAME, what=what, kind='tool', held=True).reason
+@pytest.mark.parametrize(('owners', 'are'), [(('tool',), 'is'), (('tool', 'tool_b'), 'are')])
+def test_a_frame_held_in_the_wrong_place_is_told(owners, are):
+    reason = replace(FRAME, owners=owners, kind='tool', held=True).reason
     assert reason.rule is Rule.MISTAKE
     assert reason == (
-        f'the {what} held by the chain file {are} off by 1.2 mm: correct it, or remove fixed: '
+        f'the {", ".join(owners)} held by the chain file {are} off by 1.2 mm: correct it, or remove fixed: '
         'true there'
     )
 
