@@ -324,9 +324,9 @@ class CalibrationNode(Batched):
         calibration, problem = found
         years = years_since(calibration.record, problem.all_sets)
         updated = recalibrate(calibration, problem, years)
-        given = calibration, problem.all_sets
-        found = judge(*given, of_messages=True, sigma_position=problem.sigma_position)
-        return words.still_holds(updated, found)
+        sets, sigma = problem.all_sets, problem.sigma_position
+        now = judge(calibration, sets, of_messages=True, sigma_position=sigma)
+        return words.still_holds(updated, now)
 
     def _on_clear(self, request: Any) -> Answer:
         count = len(self.session.samples)

@@ -90,10 +90,8 @@ def test_what_moved_is_told(step, said, told):
 def test_a_frame_held_in_the_wrong_place_is_told(owners, are):
     reason = replace(FRAME, owners=owners, kind='tool', held=True).reason
     assert reason.rule is Rule.MISTAKE
-    assert reason == (
-        f'the {", ".join(owners)} held by the chain file {are} off by 1.2 mm: correct it, or remove fixed: '
-        'true there'
-    )
+    said = f'the {", ".join(owners)} held by the chain file {are} off by 1.2 mm: '
+    assert reason == f'{said}correct it, or remove fixed: true there'
 
 
 def test_several_zeros_are_of_the_arm():
