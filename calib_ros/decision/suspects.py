@@ -100,7 +100,7 @@ def _arm_mistakes(chain: Chain, sets: Sets) -> Iterator[Suspect]:
     yield from _of_lengths(
         'linear joints', _linear(chain), partial(scale_joints, chain, 'prismatic')
     )
-    yield from _of_joints(chain)
+    yield from _of_joints(chain, sets[0].socket)
     yield from _of_one_unit(chain)
     yield from _of_arms(chain)
     yield from _of_frames(chain, sets)
@@ -257,8 +257,8 @@ def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:
             yield found
 
 
-def _of_joints(chain: Chain) -> Iterator[Suspect]:
-    """Yield signs, zeros, order and couplings of joints."""
+def _of_joints(chain: Chain, socket: bool) -> Iterator[Suspect]:
+    """Yield signs, zeros, order and couplings of joints, perhaps with the target in a socket."""
     names = chain.joint_names
     last, same = len(names), np.eye(len(names))
     revolute = [joint.type == 'revolute' for joint in chain.joints]
@@ -278,7 +278,8 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
         orders[where] = [*range(last - more, last), *range(last - more)]
     for where, places in orders.items():
         yield replace(reordered(f'the joints are {where}', places, rank=2), part='order')
-    tails = (('target does not move', slice(k, last)) for k in range(last - 1, 0, -1))
+    least = last - 1 if socket else 1  # on the first axes a ball stays in any socket
+    tails = (('target does not move', slice(k, last)) for k in range(last - 1, least - 1, -1))
     for stands, which in (('device moves', slice(1)), *tails):
         listed = ', '.join(names[which])
         what, remedy = f'the {stands} with {listed}', f'leave {listed} out of the chain file'
