@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A device that stretches space in one direction more than in another.
 
-No arm does, not even one that bends, so it shows in the residuals: a volume calibrated badly, a
-wrong focal length, or a wrong radius of the reflector. Such a device is hardly true to scale
-either, which does not show: lengths of the arm follow it. If its three directions are off
-independently by s, the scale is off by s / 3^(1/2), and the strain without it, a symmetric matrix,
-has the length 2^(1/2) s.
+No arm does, not even one that bends, unless its linear joints, or lengths that are held, are out
+of scale. So it shows in the residuals: a volume calibrated badly, a wrong focal length, or a wrong
+radius of the reflector. Such a device is hardly true to scale either, which does not show: lengths
+of the arm follow it. If its three directions are off independently by s, the scale is off by s /
+3^(1/2), and the strain without it, a symmetric matrix, has the length 2^(1/2) s.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from calib_ros.decision.scale import percent
 from calib_ros.decision.steps import EXPLAINED
-from calib_ros.estimation.considered import CONSIDERED
+from calib_ros.estimation.considered import CONSIDERED, considered, held_frames, travels
 from calib_ros.estimation.distortion import device_sigma, shift_rows
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import gain_of
@@ -23,7 +23,8 @@ from calib_ros.estimation.levels import SURE, chance_of
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.system import stacked
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.parameter import Parameter
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 STRAINS = np.array(
@@ -39,7 +40,7 @@ def strain_of(fitted: Fitted) -> tuple[float, str]:
     """Return the standard deviation of the scale of a strained device, and the strain in words.
 
     Zero and nothing unless a strain of the only device explains most of the residuals that usual
-    eccentricity and a usual sag of the arm leave.
+    eccentricity and a usual sag of the arm leave, with whatever is held and any scale of travel.
     """
     problem, names = fitted.problem, fitted.names
     pairs = zip(problem.sets, fitted.robust.inliers, strict=True)
@@ -50,23 +51,24 @@ def strain_of(fitted: Fitted) -> tuple[float, str]:
     )
     if len(devices) > 1 or not all(positions):
         return 0.0, ''
-    every = (name for group in CONSIDERED for name in effects.members(problem.chain, group))
-    more = [name for name in every if name not in names]
+    more = _beside(fitted)
     system, columns = problem.system(sets), [*names, *more]
-    chain = fitted.chain.with_effects(more)
+    own = (n for n in more if not (n.of_dh or problem.model.owns_frame(n)))
+    chain = fitted.chain.with_effects([*own])
     rows = stacked(list(map(_with_strains, system.rows_of(chain, columns), system.sets)))
     given, back = system.extra_rows(chain, columns)
-    usual = np.diag([0.0] * len(names) + [1.0 / effects.expected(name) for name in more])
+    usual = np.diag([0.0] * len(names) + [1.0 / size for size in more.values()])
     known = np.zeros((len(given) + len(usual), rows.shape[1]))
     known[:, : len(columns)], known[: len(given), -1] = np.vstack([given, usual]), back
-    rows, free = np.vstack([rows, known]), len(rows) - len(names) - len(STRAINS)
+    rows = np.vstack([rows, known])
+    free = np.count_nonzero(rows[:, :-1].any(axis=1)) - np.linalg.matrix_rank(rows[:, :-1])
     squares, rank, left = gain_of(rows.T @ rows, len(columns))
     share = squares / left if left > 0.0 else 0.0
     if free <= 0 or not EXPLAINED < share < 1.0:
         return 0.0, ''
     if chance_of(share / (1.0 - share) * free, rank, free) > 1.0 - SURE:
         return 0.0, ''
-    found = np.linalg.lstsq(rows[:, :-1], rows[:, -1])[0][len(columns) :]
+    found = np.linalg.lstsq(rows[:, :-1], rows[:, -1], HALF_THE_DIGITS)[0][len(columns) :]
     strain = np.tensordot(found, STRAINS, 1)
     size = percent(float(np.ptp(np.linalg.eigvalsh(strain))))
     return float(np.linalg.norm(strain)) / 6.0**0.5, (
@@ -74,6 +76,16 @@ def strain_of(fitted: Fitted) -> tuple[float, str]:
         f'another, which explains {100.0 * share:.0f} % of the residuals: its scale may be off as '
         'well. Calibrate it again (its volume or lens, or the radius of the reflector)'
     )
+
+
+def _beside(fitted: Fitted) -> dict[Parameter, float]:
+    """Return what else may explain residuals, with standard deviations [m, rad]."""
+    problem, names = fitted.problem, fitted.names
+    members = (name for group in CONSIDERED for name in effects.members(problem.chain, group))
+    found = {Parameter(name): effects.expected(name) for name in members if name not in names}
+    unknown = {*travels(fitted.chain), *held_frames(fitted.chain)}
+    held = map(Parameter, considered(fitted.chain, names, problem.fixed))
+    return found | {name: np.inf for name in held if name.of_dh or name in unknown}
 
 
 def _with_strains(rows: FloatArray, samples: Samples) -> FloatArray:

@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import SIGMAS, UR10E, arm, measured_arm
+from fits import SCARA, SIGMAS, UR10E, arm, measured_arm
 
 from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.strain import strain_of
 from calib_ros.estimation.fitting import fit
-from calib_ros.kinematics import effects
+from calib_ros.kinematics import effects, se3
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.parameter import Parameter
 
 TOLD = 'in one direction of the measuring device lengths come out 0.2'
 SCALE = 2e-3 / 3.0
@@ -93,3 +95,27 @@ def test_of_several_devices_none_is_strained_alone():
     first, other = problem.observations.select(np.arange(20)), problem.observations
     other = replace(other.select(np.arange(20, 40)), base='base_lab')
     assert strain_of(fit(Problem(UR10E, first, more=[other], **SIGMAS))) == (0.0, '')
+
+
+@pytest.mark.parametrize('size', [0.0, 2e-3])
+def test_a_linear_axis_out_of_scale_is_no_strain_of_the_device(size):
+    """The tracker was to be calibrated: the rack of the axis is 0.05 % too long."""
+    chain = load_chain('ur10e_on_linear_axis')
+    rng = np.random.default_rng(1)
+    true = arm(1, chain=chain).with_effect_values({Parameter('linear_axis_joint', 'ratio'): 5e-4})
+    q = chain.random_joints(60, rng)
+    places = true.forward(q)[:, :3, 3] + rng.normal(scale=5e-5, size=(60, 3))
+    seen = stretched(Observations.from_arrays(q, places), size, axis=1)
+    told = strain_of(fit(Problem(chain, seen, **SIGMAS)))[1]
+    assert told.startswith(TOLD) if size else told == ''
+
+
+@pytest.mark.parametrize('fixed', ['*.a', 'base.*'])
+def test_what_is_held_at_wrong_values_is_no_strain_of_the_device(fixed):
+    """Its lengths look stretched in the plane of a SCARA, or a base that is tilted."""
+    _, true, seen = measured_arm(1, 40, chain=SCARA, oriented=False)
+    chain, held = SCARA, (fixed,)
+    if fixed == 'base.*':
+        tilted = true.base.matrix @ se3.transform(se3.exp_rotation(np.full((1, 3), 3e-3))[0])
+        chain, held = replace(SCARA, base=Frame(tilted, fixed=True)), ()
+    assert strain_of(fit(Problem(chain, seen, fixed=held, **SIGMAS))) == (0.0, '')
