@@ -61,12 +61,12 @@ def strain_of(fitted: Fitted) -> tuple[float, str]:
     known = np.zeros((len(given) + len(usual), rows.shape[1]))
     known[:, : len(columns)], known[: len(given), -1] = np.vstack([given, usual]), back
     rows = np.vstack([rows, known])
-    free = np.count_nonzero(rows[:, :-1].any(axis=1)) - np.linalg.matrix_rank(rows[:, :-1])
     squares, rank, left = gain_of(rows.T @ rows, len(columns))
     share = squares / left if left > 0.0 else 0.0
-    if free <= 0 or not EXPLAINED < share < 1.0:
+    if not EXPLAINED < share < 1.0:
         return 0.0, ''
-    if chance_of(share / (1.0 - share) * free, rank, free) > 1.0 - SURE:
+    free = np.count_nonzero(rows[:, :-1].any(axis=1)) - np.linalg.matrix_rank(rows[:, :-1])
+    if free <= 0 or chance_of(share / (1.0 - share) * free, rank, free) > 1.0 - SURE:
         return 0.0, ''
     found = np.linalg.lstsq(rows[:, :-1], rows[:, -1], HALF_THE_DIGITS)[0][len(columns) :]
     strain = np.tensordot(found, STRAINS, 1)

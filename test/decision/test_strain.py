@@ -116,6 +116,7 @@ def test_what_is_held_at_wrong_values_is_no_strain_of_the_device(fixed):
     _, true, seen = measured_arm(1, 40, chain=SCARA, oriented=False)
     chain, held = SCARA, (fixed,)
     if fixed == 'base.*':
-        tilted = true.base.matrix @ se3.transform(se3.exp_rotation(np.full((1, 3), 3e-3))[0])
+        tilted = true.base.matrix.copy()
+        tilted[:3, :3] @= se3.exp_rotation(np.full((1, 3), 3e-3))[0]
         chain, held = replace(SCARA, base=Frame(tilted, fixed=True)), ()
     assert strain_of(fit(Problem(chain, seen, fixed=held, **SIGMAS))) == (0.0, '')
