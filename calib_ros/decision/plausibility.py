@@ -180,7 +180,8 @@ def _level_hand(problem: Problem, result: Identification) -> str:
     frames, joints = [n for n in ends if n not in along], problem.sets[0].joints
     *_, tilted = best_imitation(result.chain, frames, along, joints, 0.0)
     off = LEVER * np.linalg.norm(tilted) / np.sqrt(len(joints))
-    if off < 1e-3 * (result.validation or result.fitted).figures[1].rms_mm:
+    left = 1e-3 * (result.validation or result.fitted).figures[1].rms_mm
+    if off < max(left, SIMULATED):
         return ''
     return (
         f'a hand that stays level hides {", ".join(hidden)}, taken as 0, but tilts by errors of '
