@@ -120,3 +120,9 @@ def test_what_is_held_at_wrong_values_is_no_strain_of_the_device(fixed):
         tilted[:3, :3] @= se3.exp_rotation(np.full((1, 3), 3e-3))[0]
         chain, held = replace(SCARA, base=Frame(tilted, fixed=True)), ()
     assert strain_of(fit(Problem(chain, seen, fixed=held, **SIGMAS))) == (0.0, '')
+
+
+def test_no_height_of_the_target_is_asked_for_tilts_below_any_device():
+    """Tool points were told to be 9.1e-13 mm off."""
+    *_, seen = measured_arm(5, 40, (0.0, 0.0), SCARA, errors=0.0)
+    assert not any('stays level' in x for x in identify(Problem(SCARA, seen, **SIGMAS)).remarks)
