@@ -41,7 +41,7 @@ def gain_refusals(
         yield Reason(
             Rule.LARGEST_ERROR,
             f'RMS {rounded(after.rms_mm)} mm remains on held-out poses, more than '
-            f'{largest:.3g} mm (largest_error{"; less in so small a space" * tiny})',
+            f'{largest:.3g} mm (largest_error{"; less of so small an arm" * tiny})',
         )
     if not gain > limit:
         text = f'RMS {rounded(before.rms_mm)} mm before, {rounded(after.rms_mm)} mm after'

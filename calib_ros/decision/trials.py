@@ -100,13 +100,15 @@ def in_frames(problem: Problem, chain: Chain, sets: Sets) -> Trial:
 def largest_error(problem: Problem) -> float:
     """Return the largest error [m] of positions of a faulty arm.
 
-    Of a tiny one a tenth of their spread, but not less than clearly beyond the sigma.
+    Of a tiny one a tenth of its longest length or of their spread, but not less than clearly
+    beyond the sigma.
     """
     alone = [e for e in problem.sets if e.distances is None and e.pixels is None]
     placed = [e.given for e in alone if not (e.socket or e.seen)]
-    spreads = [float(np.sqrt(each.var(axis=0).sum())) for each in placed]
-    least = CLEARLY * problem.sigma_position if spreads else np.inf
-    return min(problem.largest_error, max(EXCEPTION * max(spreads, default=0.0), least))
+    sizes = [float(np.sqrt(each.var(axis=0).sum())) for each in placed]
+    sizes += [abs(length) for joint in problem.chain.joints for length in (joint.a, joint.d)]
+    least = CLEARLY * problem.sigma_position if placed else np.inf
+    return min(problem.largest_error, max(EXCEPTION * max(sizes), least))
 
 
 def largest_of(problem: Problem) -> float:

@@ -49,12 +49,16 @@ def test_a_tiny_arm_without_mistakes_is_accepted(oriented):
     assert identify(Problem(TINY, seen_of(oriented=oriented), **SIGMAS)).accepted
 
 
-def test_a_tiny_arm_is_right_to_a_tenth_of_the_spread_and_beyond_the_noise():
+def test_a_tiny_arm_is_right_to_a_tenth_of_its_size_and_beyond_the_noise():
+    """Around a fixed point a usual arm has small spreads, and is no tiny one."""
     seen = seen_of()
-    spread = (seen.positions.var(axis=0).sum()) ** 0.5
+    spread, longest = (seen.positions.var(axis=0).sum()) ** 0.5, 0.02 * abs(UR10E.joints[1].a)
+    assert spread > longest
     assert largest_error(Problem(TINY, seen, **SIGMAS)) == pytest.approx(0.1 * spread)
     still = replace(seen, positions=1e-9 * seen.positions)
+    assert largest_error(Problem(TINY, still, **SIGMAS)) == pytest.approx(0.1 * longest)
     assert largest_error(Problem(TINY, still, sigma_position=1e-3)) == pytest.approx(5e-3)
+    assert largest_error(Problem(UR10E, still, **SIGMAS)) == 0.01
     away = replace(seen, positions=1e3 * seen.positions)
     assert largest_error(Problem(TINY, away, **SIGMAS)) == 0.01
     lengths = (seen.positions**2).sum(axis=1) ** 0.5
