@@ -105,10 +105,12 @@ def largest_error(problem: Problem) -> float:
     """
     alone = [e for e in problem.sets if e.distances is None and e.pixels is None]
     placed = [e.given for e in alone if not (e.socket or e.seen)]
+    if not placed:
+        return problem.largest_error
     sizes = [float(np.sqrt(each.var(axis=0).sum())) for each in placed]
     sizes += [abs(length) for joint in problem.chain.joints for length in (joint.a, joint.d)]
-    least = CLEARLY * problem.sigma_position if placed else np.inf
-    return min(problem.largest_error, max(EXCEPTION * max(sizes), least))
+    tenth = EXCEPTION * max(sizes)
+    return min(problem.largest_error, max(tenth, CLEARLY * problem.sigma_position))
 
 
 def largest_of(problem: Problem) -> float:
