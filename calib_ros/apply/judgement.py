@@ -69,7 +69,7 @@ class Judgement:
     mistake: Diagnosis | None
     """What explains measurements that are further off than any arm."""
     noise: float
-    """RMS [m] of the noise of a noisier device, beyond the former error; without a tolerance."""
+    """RMS [m] of the noise of a noisier device beyond the former error; 0 if not decisive."""
 
     @property
     def failed(self) -> bool:
@@ -116,6 +116,7 @@ def judge(
     if limit is not None and not mistake:
         verdict = compared(limit, least[0], upper[0])
         decided = numbers[(upper <= limit) | (least > limit)]
+        noise *= verdict != compared(limit, lower[0], upper[0])
     if reused and verdict != 'FAIL':
         verdict = 'no verdict'
     return Judgement(

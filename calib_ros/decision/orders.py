@@ -111,8 +111,6 @@ def _slipped(
 ) -> tuple[Suspect, float]:
     """Return the joint whose zero explains most in later parts, and the largest error [m]."""
     arm, least = first.chain, (np.inf, '')
-    for name in (parts[0].base, parts[0].tool):
-        arm = arm.with_frame(name, replace(arm.frame(name), fixed=True))
     for joint in arm.joints:
         found = []
         for part in parts[1:]:

@@ -20,6 +20,7 @@ from calib_ros.decision.residuals import Residuals
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.report.standing import standing
 from calib_ros.report.verdicts import _by_configuration
+from calib_ros.settings import Settings
 from calib_ros.shown import rounded
 
 _UNIT = ['(mean', '+', '3', 'std)']
@@ -258,8 +259,10 @@ def test_a_device_with_more_noise_does_not_condemn_the_arm(cell, arm):
     slipped = cell[0].with_offsets({'elbow_joint.theta': 1.5e-3})
     moved = measured(slipped, seen.joints, 1, (noise, 1e-3))
     assert verify(arm, [moved], None, sigma_position=noise).verdict == 'does not hold'
-    same = verify(arm, [measured(cell[0], seen.joints, 1)], None)
-    assert (same.verdict, same.noise) == ('holds', 0.0)
+    few = measured(cell[0], seen.joints, 1)
+    for sigma in (Settings.sigma_position, noise):  # where it decides nothing it is not told
+        same = verify(arm, [few], None, sigma_position=sigma)
+        assert (same.verdict, same.noise) == ('holds', 0.0)
 
 
 def test_a_device_that_stands_elsewhere(cell, arm):
