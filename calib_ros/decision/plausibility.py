@@ -177,7 +177,7 @@ def _level_hand(problem: Problem, result: Identification) -> str:
         return ''
     ends = [*parameters_of('base'), *parameters_of('tool')]
     along = [name for name in ends if name in {f'tool.{n.kind}' for n in hidden}]
-    frames, joints = [n for n in ends if n not in along], problem.sets[0].joints
+    frames, joints = [n for n in ends if n not in along], problem.sets[0].spread().joints
     *_, tilted = best_imitation(result.chain, frames, along, joints, 0.0)
     off = LEVER * np.linalg.norm(tilted) / np.sqrt(len(joints))
     left = 1e-3 * (result.validation or result.fitted).figures[1].rms_mm
