@@ -34,7 +34,7 @@ STEPS = (
 def rounded_joints(problem: Problem) -> dict[str, float]:
     """Return the joints whose values are multiples of a step [rad or m], with the step."""
     joints = np.concatenate([each.joints for each in problem.sets])
-    steps = {name: _step(q) for name, q in zip(problem.chain.joint_names, joints.T, strict=True)}
+    steps = {name: step_of(q) for name, q in zip(problem.chain.joint_names, joints.T, strict=True)}
     return {name: step for name, step in steps.items() if step > 0.0}
 
 
@@ -54,7 +54,8 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
     return found
 
 
-def _step(values: FloatArray) -> float:
+def step_of(values: FloatArray) -> float:
+    """Return the step [rad or m] of which values (N,) are multiples; 0 for none."""
     few = values[:3, np.newaxis] / STEPS
     likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < ROUNDED, STEPS).tolist()
     for step in sorted(likely, reverse=True):

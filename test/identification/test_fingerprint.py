@@ -9,6 +9,16 @@ from calib_ros.errors import ConfigError
 from calib_ros.estimation.observations import Observations
 from calib_ros.identification.fingerprint import KEPT, Fingerprint, hashes, reused_in_words
 
+LEAST = {'count': 1, 'least': '00' * 8}
+WRONG = [
+    1,
+    {},
+    {**LEAST, 'least': 'x'},
+    {**LEAST, 'least': '00'},
+    {**LEAST, 'values': ['x']},
+    {**LEAST, 'values': ['ff' * 4]},
+]
+
 
 def rows(count, seed=0):
     rng = np.random.default_rng(seed)
@@ -69,7 +79,25 @@ def test_the_few_rows_of_an_update_are_known_after_many_others(count):
     assert len(found.latest) == KEPT
 
 
-@pytest.mark.parametrize('wrong', [1, {}, {'count': 1, 'least': 'x'}, {'count': 1, 'least': '00'}])
+@pytest.mark.parametrize('wrong', [*WRONG, {**LEAST, 'values': ['00' * 4, '00' * 8]}])
 def test_what_is_no_fingerprint_is_refused(wrong):
     with pytest.raises(ConfigError, match=r'calibration\.rows'):
         Fingerprint.of_record({'rows': wrong}, 'file')
+
+
+@pytest.mark.parametrize('count', [60, 10 * KEPT])
+@pytest.mark.parametrize('digits', [(4, 5), (3, 4)])
+def test_rows_written_with_fewer_digits_are_known_and_those_measured_again_are_not(count, digits):
+    """They held on all of their own training rows."""
+    rng, fitted = np.random.default_rng(3), rows(count)
+    found = Fingerprint.of_record({'rows': Fingerprint.of([fitted]).document()}, 'file')
+    again = replace(fitted, positions=fitted.positions + rng.normal(scale=3e-5, size=(count, 3)))
+    of_before = {key: found.document()[key] for key in ('count', 'least', 'latest')}
+    bare = Fingerprint.of_record({'rows': of_before}, 'file')
+    for seen, share in ((fitted, 1.0), (again, 0.0), (rows(count, 1), 0.0)):
+        joints, positions = map(np.round, (seen.joints, seen.positions), digits)
+        written = Observations.from_arrays(joints, positions).select(rng.permutation(count))
+        assert found.share([written]) == share
+        later = Fingerprint.of([rows(8, 2)], found)
+        assert later.share([written]) == pytest.approx(share, abs=0.05)
+        assert found.share([written.select(slice(1))]) == bare.share([written]) == 0.0
