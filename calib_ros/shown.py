@@ -28,13 +28,13 @@ def some(words: Sequence[str], most: int = NAMED) -> list[str]:
     return [*words[:most], f'and {more} more'] if more > 0 else list(words)
 
 
-def rounded(value: float) -> str:
+def rounded(value: float, sign: str = '') -> str:
     """Return mm or mrad with three decimals, more if two digits need them, or none from 1e3 on."""
     if math.isfinite(value) and abs(value) >= 1e3:
-        return f'{value:{"," if abs(value) >= 1e4 else ""}.0f}'  # 1,210 may be read as 1.210
+        return f'{value:{sign}{"," if abs(value) >= 1e4 else ""}.0f}'  # 1,210 may be read as 1.210
     told = math.isfinite(value) and abs(value) >= 1e-6  # less is what computing leaves
     digits = 1 - math.floor(math.log10(abs(value))) if told else 0
-    return f'{value:.{max(3, digits)}f}'
+    return f'{value:{sign}.{max(3, digits)}f}'
 
 
 def sentence(text: str) -> str:

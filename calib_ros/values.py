@@ -41,12 +41,12 @@ def parse_number(
     largest: float = LARGEST,
 ) -> float:
     """Return a finite number from YAML or a table; errors name it `where`."""
+    how = ''
     try:  # YAML 1.1 reads 1e-3, without a dot, as a string
         number = float(value) if isinstance(value, int | float | str) else math.nan
     except (ValueError, OverflowError):
-        number = math.nan
+        number, how = math.nan, ': write it out, such as 1.5708' * isinstance(value, str)
     if isinstance(value, bool) or not math.isfinite(number):
-        how = ': write it out, such as 1.5708' if isinstance(value, str) else ''
         raise error(f'{where} must be a finite number, not {value!r:.100}{how}')
     if abs(number) > largest:
         raise error(f'{where} must be at most {largest:g}, not {number:g}')

@@ -274,6 +274,7 @@ def test_without_pandas_that_is_said(monkeypatch):
 def test_numbers_have_the_digits_that_a_reader_needs(value, text):
     assert rounded(value) == rounded(np.float64(value)) == text
     assert rounded(-value).lstrip('-') == text
+    assert rounded(value, '+') == f'+{text}'
     assert interval_mm(value, value) == f'{text} to {text}'
 
 

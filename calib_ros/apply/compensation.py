@@ -24,6 +24,7 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import LEVER
+from calib_ros.shown import rounded
 
 BESIDE = LEVER / 3.0
 """Distance [m] from the tool at which the effect of a turn is reported: a small tool's length."""
@@ -73,24 +74,27 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
         if columns:
             worst = max(columns, key=lambda k: float(size[k]))
             name = compensator.nominal.joint_names[worst]
-            text += f', by {1e3 * size[worst]:.3f} {unit} at most ({name})'
+            text += f', by {rounded(1e3 * size[worst])} {unit} at most ({name})'
     turn, turned = result.orientation[kept].max(), result.orientation_before[kept].max()
     shift, shifted = result.position[kept].max(), result.position_before[kept].max()
-    text += f'; largest error by the calibration {1e3 * shifted:.3f} -> {1e3 * shift:.3f} mm, '
-    text += f'{1e3 * turned:.3f} -> {1e3 * turn:.3f} mrad'
+    shifts, turns = (
+        f'{rounded(1e3 * before)} -> {rounded(1e3 * after)}'
+        for before, after in ((shifted, shift), (turned, turn))
+    )
+    text += f'; largest error by the calibration {shifts} mm, {turns} mrad'
     if not compensator.follower.complete and turn > turned:
         x, y, z = compensator.tool
         text += (
             '; this arm cannot keep every orientation: the position is corrected at the '
             f'point {x:g} {y:g} {z:g} m in the flange (--tool); {BESIDE:g} m away it may be '
-            f'{1e3 * BESIDE * turn:.3f} mm off, {1e3 * BESIDE * turned:.3f} mm before'
+            f'{rounded(1e3 * BESIDE * turn)} mm off, {rounded(1e3 * BESIDE * turned)} mm before'
         )
     if not compensator.follower.anywhere:
         squares = result.position[kept] ** 2 - result.reachable[kept] ** 2
         across = np.sqrt(max(float(squares.max()), 0.0))  # less than zero is rounding
         text += (
             '; this arm cannot move its target in every direction: of the position '
-            f'{1e3 * across:.3f} mm are left, which no joint can correct'
+            f'{rounded(1e3 * across)} mm are left, which no joint can correct'
         )
     if result.damped[kept].any():
         text += f'; {np.count_nonzero(result.damped[kept])} corrected in part'

@@ -15,7 +15,7 @@ from calib_ros.cli import checks, common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files.history import History
-from calib_ros.shown import counted
+from calib_ros.shown import counted, rounded
 
 
 def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
@@ -93,7 +93,7 @@ def _run_history(options: argparse.Namespace, screen: Screen) -> int:
     for serial in serials:
         try:
             for row in history.rows(serial):
-                rms = '' if row.rms_mm is None else f'{row.rms_mm:.3f}'
+                rms = '' if row.rms_mm is None else rounded(row.rms_mm)
                 line = f'{serial:{width}}  {row.time:%Y-%m-%d %H:%M}  {row.kind:8}  '
                 line += f'{row.verdict:13}  {row.poses:5}  {rms:>8}  {row.source}'
                 screen.data(line.rstrip())

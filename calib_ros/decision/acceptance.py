@@ -17,6 +17,7 @@ from calib_ros.decision.improvement import gain_refusals, harm_refusals
 from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
+from calib_ros.decision.rounding import step_in_words
 from calib_ros.decision.trials import largest_error
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import ParameterRow
@@ -128,7 +129,7 @@ def oddities(
     units = {joint.name: joint.driven.unit for joint in problem.chain.joints}
     steps: dict[str, list[str]] = {}
     for name, size in coarse.items():
-        steps.setdefault(f'{1e3 * size:.3g} m{units[name]}', []).append(name)
+        steps.setdefault(step_in_words(size, units[name]), []).append(name)
     if steps:
         each = [f'{step} ({", ".join(names)})' for step, names in steps.items()]
         found.append(f'joint values are multiples of {", ".join(each)}: record more digits')

@@ -47,7 +47,7 @@ from calib_ros.kinematics.effects import expected
 from calib_ros.kinematics.parameter import DH_KINDS, FRAME_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.settings import LEVER
-from calib_ros.shown import Shown
+from calib_ros.shown import Shown, rounded
 
 FALSE_ALARM = 0.5 * (1.0 - CERTAIN)
 """False alarms of an unchanged arm: one side of CERTAIN (benchmarks/recalibration.py)."""
@@ -108,7 +108,7 @@ class Explanation(Shown):
 def with_limits(name: Parameter, change: float, sigma: float) -> str:
     """Return a change of a parameter in words, with its 95 % interval."""
     factor, unit = name.small_unit
-    return f'{factor * change:+.3f} ± {factor * LIKELY * sigma:.3f} {unit} (95 %)'
+    return f'{rounded(factor * change, "+")} ± {rounded(factor * LIKELY * sigma)} {unit} (95 %)'
 
 
 def reason_in_words(reasons: Sequence[Explanation]) -> str:

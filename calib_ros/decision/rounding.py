@@ -22,7 +22,7 @@ from calib_ros.estimation.system import row_samples, stacked
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.values import ROUNDED
+from calib_ros.values import ROUNDED, SAME
 
 STEPS = (
     *(1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4),
@@ -36,6 +36,13 @@ def rounded_joints(problem: Problem) -> dict[str, float]:
     joints = np.concatenate([each.joints for each in problem.sets])
     steps = {name: step_of(q) for name, q in zip(problem.chain.joint_names, joints.T, strict=True)}
     return {name: step for name, step in steps.items() if step > 0.0}
+
+
+def step_in_words(step: float, unit: str) -> str:
+    """Return a step of rounded values [rad or m] in the unit in which they were written."""
+    degrees = round(float(np.rad2deg(step)), 3)
+    written = unit == 'rad' and abs(np.deg2rad(degrees) / step - 1.0) < SAME
+    return f'{degrees:g}°' if written else f'{1e3 * step:.3g} m{unit}'
 
 
 def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, float]:

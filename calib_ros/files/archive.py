@@ -15,6 +15,7 @@ from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryFile, mkdtemp
+from typing import Any
 from urllib.parse import quote
 
 from calib_ros.atomic import (
@@ -94,19 +95,18 @@ class Archive:
         """Return the path of the journal, if any."""
         return None if self._journal is None else self._journal.path
 
-    def begin(self) -> str:
-        """Show that a session begins, so that the journal before is not resumed; tell of that."""
+    def begin(self, log: Any) -> None:
+        """Show that a session begins, so that the journal before is not resumed; log that."""
         with suppress(OSError):  # told with the first pose
             self._mark = locked(self.path)
         if (earlier := self.newest_journal()) is None:
-            return ''
+            return
         try:
-            os.close(locked(earlier, create=0))
+            with suppress(OSError):  # told when it is read
+                os.close(locked(earlier, create=0))
+            log.info(f'a new session begins: to continue {earlier}, start with resume:=true')
         except InputError as err:
-            return str(err)
-        except OSError:  # told when it is read
-            pass
-        return f'a new session begins: to continue {earlier}, start with resume:=true'
+            log.warning(str(err))
 
     def add(self, sample: Sample) -> None:
         """Keep a sample."""

@@ -15,7 +15,7 @@ from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.results import results, too_late, verifications
 from calib_ros.fleet.run import Run
 from calib_ros.fleet.watch import Watched, alarms_of, watch
-from calib_ros.shown import counted, some
+from calib_ros.shown import counted, rounded, some
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +85,9 @@ class RobotStatus:
         found = list(self.alarms)
         if self.last is not None and not self.last.accepted:
             found.append(f'not accepted: {"; ".join(some(self.last.reasons, 1))}')
-        if self.last is not None and self.share > 1.0:
+        if self.last is not None and self.last.rms_mm is not None and self.share > 1.0:
             wanted = self.robot.tolerance
-            found.append(f'beyond tolerance: {self.last.rms_mm:.3f} mm, wanted {wanted:g} mm')
+            found.append(f'beyond tolerance: {rounded(self.last.rms_mm)} mm, wanted {wanted:g} mm')
         return tuple(found)
 
     @property

@@ -49,7 +49,7 @@ from calib_ros.files.rows import Row
 from calib_ros.identification.age import YEAR, drift_of
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.shown import counted, some
+from calib_ros.shown import counted, rounded, some
 
 LAGS = tuple(2**k for k in range(1 + TELLING))
 """Nights, 1 to 256, in which a change is sought: large ones show at once, small and slow ones
@@ -98,8 +98,8 @@ def alarms_of(changes: Sequence[Change]) -> Iterator[str]:
         size = factor * sum(each.alone[min(shared)] for each in run)
         names = ' or '.join(sorted(name for name, _ in shared))
         yield (
-            f'{run[0].time:%Y-%m-%d}: {names} creeps: by {size:+.3f} {unit} in {len(run)} changes '
-            f'up to {run[-1].time:%Y-%m-%d}: is it worn or loose?'
+            f'{run[0].time:%Y-%m-%d}: {names} creeps: by {rounded(size, "+")} {unit} in '
+            f'{len(run)} changes up to {run[-1].time:%Y-%m-%d}: is it worn or loose?'
         )
 
 

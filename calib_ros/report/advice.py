@@ -112,7 +112,7 @@ class Situation:
 
 
 def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tuple[Advice, ...]:
-    """Return the refusals in plain words, grouped by rule, consequences last."""
+    """Return the refusals in plain words, grouped by rule, consequences last, each step once."""
     found: dict[Rule, list[Reason]] = {}
     for each in reasons:
         found.setdefault(each.rule, []).append(each)
@@ -138,7 +138,9 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
         first = situation.first_of(rule)
         if DRIFTS in first:
             refusal = replace(refusal, again=rules()[Rule.DRIFT].again)
-        advised.append(replace(refusal, steps=(*first, *refusal.steps)))
+        said = {step for each in advised for step in each.steps}
+        steps = tuple(each for each in (*first, *refusal.steps) if each not in said)
+        advised.append(replace(refusal, steps=steps))
     for cause, texts in following.items():
         heading = f'Likely consequences of "{rules()[cause].heading}"'
         advised.append(Advice(heading, '', (), '; '.join(texts)))

@@ -15,6 +15,7 @@ from importlib import resources
 from typing import Any
 
 from calib_ros.report.content import Report, State
+from calib_ros.shown import rounded
 from calib_ros.texts import one_line
 
 MARKS: dict[State, str] = {'good': '✔', 'bad': '✘', 'open': '?', 'info': 'i'}
@@ -87,6 +88,7 @@ def filled(template: str, **values: Any) -> str | None:
     )
     values |= {'marks': MARKS, 'css': _template('report.css'), 'js': _template('report.js')}
     safe = environment.filters['safe']
+    environment.filters['rounded'] = rounded
     environment.filters['typed'] = lambda text: safe(with_code(text))
     page: str = environment.get_template(template).render(**values)
     return page

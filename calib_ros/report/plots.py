@@ -16,6 +16,7 @@ from calib_ros.decision.result import Identification
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.drawing import blank_figure, png_of
 from calib_ros.report.figures import AFTER, BEFORE
+from calib_ros.shown import rounded
 from calib_ros.texts import one_line
 
 MARGIN = 0.01  # free margin around a board [m]; a convention
@@ -33,7 +34,8 @@ def before_after_png(result: Identification) -> bytes:
     for name, errors, colour in (('before', before, BEFORE), ('after', after, AFTER)):
         rms = np.sqrt(np.mean(errors**2))
         left.plot(errors, '.', color=colour, markersize=4, alpha=0.7, rasterized=True)
-        left.axhline(rms, color=colour, label=f'{name}: RMS {rms:.3f} mm, max {errors.max():.3f}')
+        label = f'{name}: RMS {rounded(rms)} mm, max {rounded(errors.max())}'
+        left.axhline(rms, color=colour, label=label)
         share = 100.0 * np.arange(1, len(errors) + 1) / len(errors)
         right.plot(np.sort(errors), share, color=colour, drawstyle='steps-post')
     thing = 'measurement' if result.images else 'pose'  # a corner, or one of both
@@ -61,7 +63,7 @@ def workspace_png(survey: Survey) -> bytes:
         axes[0].hist(1e3 * errors, bins=60, color=AFTER, alpha=0.7)
         for share, style in ((0.5, '-'), (0.95, '--')):
             value = 1e3 * float(np.quantile(errors, share))
-            name = f'{100.0 * share:.0f} %: {value:.3f} mm'
+            name = f'{100.0 * share:.0f} %: {rounded(value)} mm'
             axes[0].axvline(value, color='black', linestyle=style, label=name)
         axes[0].set(xlabel=f'{label} [mm]', yticks=[], xlim=(0.0, None))
         axes[0].locator_params(axis='x', nbins=6)
@@ -91,7 +93,7 @@ def placements_png(placements: Placements) -> bytes:
         dots = axes.scatter(x[reached], y[reached], **colours)
         figure.colorbar(dots, ax=axes, label='expected error [mm]')
         for name, k, shape in (('best', placements.best, '*'), ('centre', placements.centre, 'X')):
-            label, look = f'{name}: {errors[k]:.3f} mm', {'markersize': 11, 'mec': 'white'}
+            label, look = f'{name}: {rounded(errors[k])} mm', {'markersize': 11, 'mec': 'white'}
             axes.plot(x[k], y[k], shape, color='red', label=label, **look)
         _in_metres(axes, 'xyz'[pair[0]], 'xyz'[pair[1]])
         axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), frameon=False)

@@ -143,7 +143,7 @@ def outliers(poses: Poses) -> Section:
         f'{more}',
         head=('from', 'residual [usual errors]', 'error after [mm]'),
         rows=tuple(
-            (poses.source(k), size, f'{after[k]:.3f}')
+            (poses.source(k), size, rounded(after[k]))
             for k in rows[:50].tolist()
             for size in ('held out' if np.isnan(poses.size[k]) else f'{poses.size[k]:.1f}',)
         ),

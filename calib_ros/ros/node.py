@@ -57,6 +57,7 @@ from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.source_texts import parse_sources
 from calib_ros.sampling.sources import STANDARD
 from calib_ros.sampling.streams import Stream, source_streams
+from calib_ros.shown import rounded
 
 DIAGNOSTICS_PERIOD = 1.0  # time [s] between two reports on /diagnostics, the usual one
 TAKING_PERIOD = DIAGNOSTICS_PERIOD / 10.0
@@ -98,8 +99,8 @@ class CalibrationNode(Batched):
         """Samples not kept in data_dir at the end, and why; empty if all were."""
         if given.resume:
             self._resume()
-        elif words := self._archive.begin():
-            self.get_logger().info(words)
+        else:
+            self._archive.begin(self.get_logger())
         self._inputs = Inputs(self, self._streams())
         refuse_unknown_names(self, names)
         self.add_on_set_parameters_callback(self._check_parameters)
@@ -208,8 +209,7 @@ class CalibrationNode(Batched):
         topics = settings.joint_topics or ('joint_states',)
         sources = parse_sources(settings.sources) or STANDARD
         types = {source.topic: 'geometry_msgs/msg/PoseStamped' for source in sources}
-        streams = [Stream(topic, JOINT_STATE) for topic in topics]
-        return streams + source_streams(sources, types)
+        return [*(Stream(topic, JOINT_STATE) for topic in topics), *source_streams(sources, types)]
 
     @property
     def polled(self) -> Iterator[Any]:
@@ -294,11 +294,11 @@ class CalibrationNode(Batched):
         number = f'{self._archive.trouble}pose {len(self.session.samples)}'
         if socket:
             return True, f'{number} taken: ball in socket {socket}'
-        taken = self.session.samples[-count:]
-        words = ', '.join(
-            f'{each.count} measurements, spread {1e3 * each.spread:.3f} mm' for each in taken
+        told = (
+            f'{each.count} measurements, spread {rounded(1e3 * each.spread)} mm'
+            for each in self.session.samples[-count:]
         )
-        return True, f'{number} taken ({words})'
+        return True, f'{number} taken ({", ".join(told)})'
 
     def _on_remove_last(self, request: Any) -> Answer:
         self.session.remove_last()

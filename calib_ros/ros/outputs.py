@@ -133,7 +133,8 @@ class Keeper:
         session = self._session
         if path is None:
             there = f'{session.chain.name} in {self._archive.folder}'
-            raise InputError(f'there is no saved calibration of {there}: set calibration_filename')
+            how = 'call ~/identify and ~/save first, or set calibration_filename'
+            raise InputError(f'there is no saved calibration of {there}: {how}')
         text = _calibration_text(path)
         calibration = parse_calibration(text, str(path), session.chain, session.settings)
         calibration.serial_of(str(path), self._given.serial)
@@ -163,7 +164,7 @@ class Keeper:
         if self._urdf:
             forms += (urdf_export('corrected.urdf', self._urdf, chain, links),)
         files = {each.name: each.content for each in forms}
-        return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
+        return True, f'{len(files)} files exported to {self._archive.export(files)}'
 
     def publish_pose(self) -> None:
         """Publish the corrected pose of the latest joint values, once."""
@@ -197,7 +198,8 @@ class Keeper:
 def _calibration_text(path: Path) -> str:
     """Return the text of a chain file; the content of other files must not leak."""
     if not path.is_file():
-        raise InputError(f'there is no file {path}')
+        how = "set calibration_filename to a saved one, or to '' for the newest"
+        raise InputError(f'there is no file {path}: {how}')
     try:
         text = chain_text(path)
         parse_chain(text)

@@ -196,7 +196,8 @@ class Collector:
         if not len(stands) or stands[-1, 1] < newest:
             long = max(1.0, self.settings.settle + self.settings.shortest_stop)
             ask = f': let it stand at each pose for {long:g} s'
-            return f'the arm is moving{"" if self.sampler.rested else ask}'
+            known = self.sampler.rested or self._seated_ns
+            return f'the arm is moving{"" if known else ask}'
         if stands[-1, 0] <= max(self._sampled_ns, self._seated_ns):
             return 'the arm stands and its pose is measured: move on'
         if (

@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import logging
 import os
 import resource
 import shutil
@@ -24,17 +25,24 @@ def full_disk(limit):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_a_second_node_is_told_of_the_one_that_runs_and_not_to_delete_its_journal(tmp_path):
+def test_a_second_node_is_told_of_the_one_that_runs_and_not_to_delete_its_journal(
+    tmp_path, caplog
+):
     """Before the first pose it was "to continue yesterday's instead, delete" that of the first."""
     written(tmp_path, 1)
     first, second, said = open_archive(tmp_path), open_archive(tmp_path), 'another process writes'
-    first.begin()
+    first.begin(logging.getLogger())
     with pytest.raises(InputError, match=f'{said} {first.path}: stop it, or give each robot'):
         second.resume()
     first.add(sample(2))
-    assert second.begin().startswith(f'{said} {first.path}: ')  # not "start with resume"
+    caplog.set_level(logging.INFO)
+    second.begin(logging.getLogger())
     first.close()
-    assert 'to continue' in open_archive(tmp_path).begin()
+    open_archive(tmp_path).begin(logging.getLogger())
+    other, old = caplog.records
+    assert other.message.startswith(f'{said} {first.path}: ')  # not "start with resume"
+    assert old.message.endswith(f'to continue {first.path}, start with resume:=true')
+    assert (other.levelname, old.levelname) == ('WARNING', 'INFO')
 
 
 def test_a_full_disk_loses_nothing(tmp_path):

@@ -161,6 +161,7 @@ WRONG = [
     ('d: 0.1273', 'd: 0,089', 'joint 1: a number has no key: write 0.5, not 0,5'),
     ('name: joint_1', '1: joint_1', 'joint 1: unknown key "1"'),
     ('joints:\n', 'joints:\n\t', 'not valid YAML: .*: indent with blanks, not tabs'),
+    ('d: 0.1273', "d: 'nan'", "joint 1: d must be a finite number, not 'nan'$"),
     ('d: 0.1273', 'd: [1]', 'joint 1: d must be a finite number'),
     ('d: 0.1273', 'd: yes', 'joint 1: d must be a finite number, not True'),
     ('d: 0.1273, ', '', 'joint 1: key "d" is missing'),

@@ -177,6 +177,13 @@ def test_what_follows_from_another_reason_sends_nobody_elsewhere(rules, steps, l
     assert told[0].heading in told[-1].heading
 
 
+def test_what_two_rules_ask_for_is_told_once():
+    both = (Rule.LARGEST_ERROR, Rule.OUTLIERS)
+    first, second = advice.advice([Reason(rule, rule.name) for rule in both])
+    assert first.steps == refusals.rules()[Rule.LARGEST_ERROR].steps
+    assert second.steps == refusals.rules()[Rule.OUTLIERS].steps[:2]
+
+
 def test_a_refused_page_says_why_and_what_to_do():
     rng = np.random.default_rng(3)
     rows = measured(chain=UR, count=40)

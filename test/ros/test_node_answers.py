@@ -39,7 +39,7 @@ def test_errors_are_answers(cell, recording):
         ('capture', 'no joint states received'),
         ('remove_last', 'no pose to remove'),
         ('validate', 'identify or load one first'),
-        ('load', 'no saved calibration of ur10e'),
+        ('load', '~/save first, or set calibration_filename'),
     ):
         assert said in cell.refused(name).message
     cell.play(part(recording, 0.0, 2.0))
@@ -342,7 +342,7 @@ def test_a_calibration_that_could_be_loaded_is_named_but_not_published(saved):
         assert node.session.calibration is None
 
 
-@pytest.mark.parametrize(('content', 'said'), [(None, 'there is no file'), ('puma', 'joints')])
+@pytest.mark.parametrize(('content', 'said'), [(None, "or to '' for"), ('puma', 'joints')])
 def test_what_cannot_be_loaded_at_the_start_is_told_and_costs_nothing_else(
     tmp_path, recording, content, said
 ):

@@ -37,6 +37,12 @@ def captured(problem, count=4):
     return session
 
 
+def test_who_has_captured_a_pose_is_no_longer_told_how_to_stop():
+    session = captured(cell(0)[1], count=1)
+    take(session, of_joints(joint_state(18 * S, IIWA.joint_names, [0.5] * 7)))
+    assert session.status().startswith('the arm is moving; ')
+
+
 def test_sockets_are_identified_from_the_node_as_from_a_table(tmp_path):
     _, problem = cell(0, count=12)
     session = captured(problem, 12)

@@ -82,7 +82,8 @@
   const state = { when: 'after', picked: -1, page: 0, component: 'length', rows: all };
   const byId = (id) => document.getElementById(id);
   const escaped = (text) => text.replaceAll('&', '&amp;').replaceAll('<', '&lt;');  // plotly reads tags
-  const fixed = (x, digits = 3) => (Number.isFinite(x) ? x.toFixed(digits) : '');
+  const digitsOf = (x) => (Math.abs(x) < 1e-6 ? 3 : Math.max(3, 1 - Math.floor(Math.log10(Math.abs(x)))));
+  const fixed = (x, digits = digitsOf(x)) => (Number.isFinite(x) ? x.toFixed(digits) : '');
   const scale = () => Number((10 ** Number(byId('scale').value)).toPrecision(2));
 
   // Forward kinematics of the corrected arm, for the picture alone
@@ -265,7 +266,8 @@
     const type = count > 2000 && hasGL() ? 'scattergl' : 'scatter';
     const one = (when, list, more) => ({
       type, mode: 'markers', x: list.map(xs), y: list.map((i) => value(when, i)), customdata: list,
-      text: list.map((i) => source(i)), hovertemplate: '%{text}<br>%{y:.3f}<extra></extra>', ...axis, ...more });
+      text: list.map((i) => `${source(i)}<br>${fixed(value(when, i))}`), hovertemplate: '%{text}<extra></extra>',
+      ...axis, ...more });
     const found = [
       one('before', good, { name: 'before', marker: { color: BEFORE, size: 4, symbol: 'diamond', opacity: 0.6 } }),
       one('after', good, { name: 'after', marker: { color: AFTER, size: 4, opacity: 0.8 } }),
@@ -275,9 +277,7 @@
     const low = shown.reduce((a, b) => Math.min(a, b), 0), high = shown.reduce((a, b) => Math.max(a, b), 0);
     const far = outliers.map((i) => Math.max(2 * low - high, Math.min(2 * high - low, value('after', i))));
     const name = outliers.some((i, k) => far[k] !== value('after', i)) ? 'outliers, far ones drawn nearer' : 'outliers';
-    found.push(one('after', outliers, {
-      name, y: far, text: outliers.map((i) => `${source(i)}<br>${fixed(value('after', i))}`), hovertemplate: '%{text}<extra></extra>',
-      marker: { color: OUT, size: 9, symbol: 'x' } }));
+    found.push(one('after', outliers, { name, y: far, marker: { color: OUT, size: 9, symbol: 'x' } }));
     return found;
   }
   function bands(bin, axis) {
