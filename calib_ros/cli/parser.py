@@ -28,6 +28,10 @@ WAY = (
 )
 
 
+READING = ('--columns', '--length', '--angle', '--joint-angle', '--decimal', '--separator')
+"""Options of commands that read tables of other systems, missed with programs."""
+
+
 def unknown_word(word: str, parser: argparse.ArgumentParser) -> str:
     """Return what is wrong with a word that the parser does not know."""
     if not word.startswith('-'):
@@ -37,6 +41,8 @@ def unknown_word(word: str, parser: argparse.ArgumentParser) -> str:
     option = word.partition('=')[0]
     known = (each for action in parser._actions for each in action.option_strings)
     hint = near(option, known, 0.7)
+    if option in READING:
+        hint = 'name columns and units in the first line of the file: q1 [deg]'
     return f'unknown option "{option}"' + (f': {hint}' if hint else '')
 
 

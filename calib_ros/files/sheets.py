@@ -23,7 +23,7 @@ from calib_ros.files.columns import (
     from_rows,
     lines_in_words,
 )
-from calib_ros.files.encodings import WESTERN, text_and_encoding
+from calib_ros.files.encodings import text_and_encoding
 from calib_ros.files.headers import name_and_unit, only_index, places
 from calib_ros.files.layouts import Layout
 from calib_ros.files.names import groups
@@ -115,7 +115,7 @@ def read_sheet(
 def _of_text(path: Path, layout: Layout) -> _Content:
     text, coding = text_and_encoding(path)
     told = f'the text is read as {coding}, because it is not UTF-8'
-    notes = [told] if coding in WESTERN else []
+    notes = [told] if not coding.startswith('utf') else []
     if '\r' in text:
         text = text.replace('\r\n', '\n').replace('\r', '\n')
     comments: list[str] = []

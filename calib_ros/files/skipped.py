@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from calib_ros.files.vocabulary import MEASURED_COLUMNS, POSITION
 from calib_ros.kinematics.se3 import Flags
 
 COMMENTS = ('#', '%', '//')
+NOT_VALID = ('0', '0.0', 'false', 'no', 'invalid')
 
 
 def without_words(
@@ -65,6 +67,7 @@ def drop_unmeasured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
     measuring = [name for name in MEASURED_COLUMNS if name in made.cells]
     for rows_of, what in (
         (lambda left: np.logical_and.reduce([*map(left.blank, measuring)]), 'nothing measured'),
+        (_not_valid, 'the column valid says no'),
         (_lost, 'no target (x = y = z)'),
         (rows_of_statistics, 'mean, sum or the like of all others'),
     ):
@@ -74,7 +77,13 @@ def drop_unmeasured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
                 raise InputError(f'{left}: rows need x, y, z or distance')
             notes.append(f'{left}: skipped')
             made = made.select(~rows)
-    return made, tuple(notes)
+    cells = {name: given for name, given in made.cells.items() if name != 'valid'}
+    return replace(made, cells=cells), tuple(notes)
+
+
+def _not_valid(made: Columns) -> Flags:
+    given = made.texts('valid') if 'valid' in made.cells else [''] * len(made.lines)
+    return np.array([cell.lower() in NOT_VALID for cell in given], dtype=bool)
 
 
 def _lost(made: Columns) -> Flags:

@@ -100,7 +100,7 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
         if {*TURNS} <= {*cells}:
             notes.append(f'{path}: {TURNS_LEFT}')
         notes += turns_in(path, [name_and_unit(name)[0] for name in found.header])
-    known = {*columns(joints), *TURNS, 'plane', f'q{joints + 1}'}
+    known = {*columns(joints), *TURNS, 'plane', 'valid', f'q{joints + 1}'}
     return kept, (*notes, *not_read(path, [name for name in cells if name not in known]))
 
 

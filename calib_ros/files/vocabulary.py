@@ -71,7 +71,10 @@ MATRIX = tuple(f'r{i}{j}' for i in (1, 2, 3) for j in (1, 2, 3))
 SIGMAS = ('sx', 'sy', 'sz', 'srx', 'sry', 'srz')
 """Standard deviations of x y z, and of rx ry rz (or about x y z of the device)."""
 SOCKETS = ('location', 'socket', 'plane')
-WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand', 'stamp_ns', *SOCKETS)
+WORDS = (
+    *('session', 'device', 'target', 'frame_id', 'split', 'valid', 'eye_in_hand', 'stamp_ns'),
+    *SOCKETS,
+)
 """Columns of text."""
 NUMBERS = (*POSE_COLUMNS, *TURNS, *IN_TURN, *MATRIX, *SIGMAS, 'distance', 'time', 'delay')
 JOINT = re.compile('[qsva][0-9]+')

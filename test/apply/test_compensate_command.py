@@ -295,6 +295,13 @@ def test_of_many_refused_points_the_first_are_named(run):
     assert err.endswith('refused: and 4 more, up to line 10\n')
 
 
+def test_names_and_units_of_a_program_are_in_its_first_line(run, capsys):
+    """Of identify they may be options."""
+    with pytest.raises(SystemExit):
+        run(TABLE, '--columns', 'q*=J*')
+    assert 'in the first line of the file: q1 [deg]\n' in capsys.readouterr().err
+
+
 def test_options_reach_the_compensator(run):
     q = regular(UR, 1)
     q[0, 4] = 0.0

@@ -130,6 +130,10 @@ def test_cells_in_quotes_windows_text_and_a_byte_order(read):
     table = read(named.encode('cp1252'), columns={'q1': '{Gel\u00e4nk 1}'})
     assert_same(table, None)
     assert 'Windows-1252' in ' '.join(table.warnings)
+    named = PLAIN.replace('q1', '关节1')
+    table = read(named.encode('gbk'), columns={'q1': '关节1'})
+    assert_same(table, None)
+    assert 'GB18030' in ' '.join(table.warnings)
 
 
 MOTIVE = """Format Version,1.23,Take Name,take,Rotation Type,Quaternion,Length Units,Millimeters
@@ -341,7 +345,7 @@ def test_joint_values_that_stand_a_row_below(read):
         *((DEGREES.replace('90', turn), each, r'line 2: rx, ry, rz .* in degrees, .*--angle deg')
           for turn, each in (('90', {'euler': 'XYZ'}), ('-90', {'rotation_vector': True}))),
         (b'\xff\xfe\0\xd8', {}, 'cannot read .*: unexpected end of data'),
-        (b'PK\xff\0', {}, 'not a workbook by its name: save it as .xlsx or CSV'),
+        (b'PK\xff\0', {}, 'nor a workbook by its name: save it as CSV in UTF-8'),
         ('q1,x\n1,2\n1,2\0'.encode('utf-16'), {}, 'line 3 '),  # csv of Python 3.10 says it
     ],
 )  # fmt: skip

@@ -56,6 +56,19 @@ def test_statistics_below_a_table_are_no_poses(tmp_path, rows):
         assert any(note.startswith(f'{path}: statistics in line') for note in table.warnings)
 
 
+@pytest.mark.parametrize(('yes', 'no'), [('1', '0'), ('True', 'False')])
+def test_rows_that_a_column_calls_invalid_are_left_out(tmp_path, yes, no):
+    """They were outliers: some trackers repeat the last position while the target is hidden."""
+    path = tmp_path / 'cell.csv'
+    first, *lines = PLAIN.splitlines()
+    rows = [*(f'{line},{yes}' for line in lines), f'0.1,0.2,0.3,0.4,0.5,{no}']
+    path.write_text('\n'.join([f'{first},valid', *rows, '']))
+    for table in tables(path):
+        assert_same(table, None)
+        told = f'{path}: the column valid says no in line 5: skipped'
+        assert [note for note in table.warnings if 'valid' in note] == [told]
+
+
 MANY = np.random.default_rng(7).normal(0.1, 0.8, (20, 5)).round(4)
 SUMMARIES = {
     'mean': (np.mean,),
