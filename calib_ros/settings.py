@@ -174,6 +174,11 @@ class Settings:
         """Return the standard deviations of positions [m] and orientations [rad]."""
         return self.sigma_position, self.sigma_orientation
 
+    @property
+    def given_sigma(self) -> float | None:
+        """Return the standard deviation of positions [m], None at its default."""
+        return None if self.sigma_position == Settings.sigma_position else self.sigma_position
+
     def for_problem(self) -> dict[str, Any]:
         """Return the settings of an identification, by the names of `Problem`."""
         from calib_ros.values import parse_number  # loads numpy, not needed by --help

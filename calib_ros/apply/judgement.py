@@ -25,12 +25,13 @@ from calib_ros.decision import mistakes
 from calib_ros.decision.comparison import Comparison, along_base, compare
 from calib_ros.decision.diagnosis import Diagnosis
 from calib_ros.errors import MOST_ENTRIES
-from calib_ros.estimation.levels import CONFIDENT
+from calib_ros.estimation.levels import CLEARLY, CONFIDENT
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.se3 import Index
 from calib_ros.settings import Settings
+from calib_ros.shown import rounded
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
 STANDS: dict[Verdict, Verdict] = {'PASS': 'holds', 'FAIL': 'does not hold'}
@@ -77,6 +78,20 @@ class Judgement:
         return self.verdict in ('FAIL', 'does not hold')
 
     @property
+    def overstated(self) -> str:
+        """Return that the stated noise, which decides, contradicts the errors; empty if not.
+
+        Stated is often the accuracy of a device, a few times its noise.
+        """
+        if self.noise <= CLEARLY * self.rms:
+            return ''
+        return (
+            f'the noise stated for the device, {rounded(1e3 * self.noise)} mm more than in the '
+            f'calibration, contradicts the errors of {rounded(1e3 * self.rms)} mm in all: state '
+            'its own (sigma_position)'
+        )
+
+    @property
     def group(self) -> Index:
         """Return the configuration (N,) of each measurement; `configurations` counts them."""
         return self.comparison.before.configurations
@@ -95,14 +110,14 @@ def judge(
     confidence: float = CONFIDENT,
     lost: int = 0,
     of_messages: bool = False,
-    sigma_position: float = Settings.sigma_position,
+    sigma_position: float | None = None,
 ) -> Judgement:
     """Judge a calibrated arm by its errors at new measurements, in its frames if not given.
 
     Each configuration counts once, however often it was measured; fitted frames have absorbed the
     errors of `lost` ones. Without a `tolerance` [m] the limit is that of the calibration. Remedies
     of a mistake are those of messages or of tables. `sigma_position` [m] is the noise of positions
-    without a covariance; the default is that of the earlier device.
+    without a covariance; None stands for that of the earlier device.
     """
     found = found or along_base(compare(arm.before, arm.chain, sets), arm.chain, sets)
     moments = moments_of(found.after.position, found.before.configurations)
@@ -135,15 +150,15 @@ def judge(
     )
 
 
-def _noise_beyond(arm: Calibration, sets: Sequence[Observations], sigma: float) -> float:
+def _noise_beyond(arm: Calibration, sets: Sequence[Observations], stated: float | None) -> float:
     """Return by how much the mean square noise [m^2] exceeds the former noise and error."""
     if arm.noise is None or arm.residual is None or any(s.pixels is not None for s in sets):
         return 0.0
     problem = Problem(arm.before, sets[0], more=sets[1:])  # the earlier device
-    then, now = (
-        arm.noise.expected_in(each).sigma_position
-        for each in (problem, replace(problem, sigma_position=sigma))
-    )
+    then = now = arm.noise.expected_in(problem).sigma_position
+    if stated is not None:
+        problem = replace(problem, sigma_position=stated)
+        now = arm.noise.expected_in(problem, ('sigma_position',)).sigma_position
     found = np.concatenate([each.covariances((now, 1.0))[:, :3, :3] for each in sets])
     former = max(3.0 * then**2, arm.residual**2)
     return max(0.0, float(np.trace(found.mean(axis=0))) - former)

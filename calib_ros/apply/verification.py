@@ -25,7 +25,6 @@ from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
-from calib_ros.settings import Settings
 
 NEEDED = 1 + len(TILTED)  # configurations without those for fitted frames: as in ISO 9283
 
@@ -40,14 +39,14 @@ def verify(
     commanded: FloatArray | None = None,
     new_tool: bool = False,
     progress: Notify = quiet,
-    sigma_position: Positive = Settings.sigma_position,
+    sigma_position: Positive | None = None,
 ) -> Verification:
     """Judge a calibrated arm on measurements that were not used for it.
 
     `sets` are new measurements of poses or positions, in the frames of the calibration. Without a
     `tolerance`, the largest acceptable RMS position error [m], the verdict is whether the
     calibration holds, by `Calibration.limit`; `sigma_position` [m] is the noise of positions
-    without a covariance. `progress` receives the share done.
+    without a covariance, None that of the earlier device. `progress` receives the share done.
 
     With `new_base` the measuring devices were moved, with `new_tool` the targets replaced. Fitting
     a frame absorbs the errors of two configurations, or of one (on the flange: of one, or two).

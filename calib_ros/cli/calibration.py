@@ -50,7 +50,7 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
         )
     nominal = load_chain(options.chain)
     arm = calibration_of(options.calibration, 'compensate --calibration', nominal)
-    limits = {item.name: getattr(options, item.name) for item in fields(Limits)}
+    limits = {item.name: vars(options).get(item.name, item.default) for item in fields(Limits)}
     compensator = Compensator(nominal, arm.chain, tuple(options.tool), **limits, region=arm.region)
     with screen.work(f'correcting {options.program.name}') as work:
         source = program_of(options.program, nominal)

@@ -26,7 +26,8 @@ NEEDS = {
 def refuse(options: argparse.Namespace, names: Iterable[str], why: str) -> None:
     """Refuse options that are not at their default, and tell why."""
     for name in names:
-        if vars(options).get(name) != options.parser.get_default(name):
+        default = options.parser.get_default(name)
+        if vars(options).get(name, default) != default:
             raise InputError(f'--{name.replace("_", "-")} {why}')
 
 

@@ -81,7 +81,10 @@ def add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> 
 
 
 def add_fields(group: Group, items: Iterable[Field[Any]]) -> None:
-    """Add an option for each field of a dataclass that has a text; None stands for a number."""
+    """Add an option for each field of a dataclass that has a text; None stands for a number.
+
+    Those that are not given are missing: a given one may have the value of the default.
+    """
     for item in items:
         many, text = isinstance(item.default, tuple), item.metadata['text']
         if item.default not in ((), '', None):
@@ -92,7 +95,7 @@ def add_fields(group: Group, items: Iterable[Field[Any]]) -> None:
             f'--{item.name.replace("_", "-")}',
             type=kind,
             action='append' if many else 'store',
-            default=[] if many else item.default,
+            default=[] if many else argparse.SUPPRESS,
             metavar='NAME,...' if many else {float: 'X', int: 'N'}.get(kind, 'NAME'),
             help=text,
         )

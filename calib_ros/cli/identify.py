@@ -99,7 +99,8 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         problem = loaded.between(previous.frames_of(loaded.owners))
         new = frames_of_sets(problem.all_sets, options.new_base, options.new_tool)
         with screen.work('looking for what has changed'):
-            found = recalibrate(previous, problem, years, 1e-3 * options.growth, new)
+            stated = [name for name in problem.sigmas if vars(options).get(name)]
+            found = recalibrate(previous, problem, years, 1e-3 * options.growth, new, stated)
         figures = documents.figures_document(found.comparison)
         text = dump_json(found.document() | figures) + '\n'
         if options.out is not None:

@@ -61,7 +61,7 @@ def _verified(
     commanded = read_joints(options.commanded, nominal) if options.commanded else None
     tolerance = None if options.tolerance is None else 1e-3 * options.tolerance
     confidence, moved = options.confidence, (options.new_base, options.new_tool)
-    sigma = common.settings_of(options).sigma_position
+    sigma = vars(options).get('sigma_position')
     with screen.work('judging') as work:
         given = confidence, moved[0], commanded, moved[1], work, sigma
         found = verify(arm, sets, tolerance, *given)

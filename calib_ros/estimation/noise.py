@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -48,16 +48,16 @@ class Noise:
     size: float = 1.0
     given: Mapping[str, float] = field(default_factory=dict)
 
-    def expected_in(self, problem: Problem) -> Problem:
+    def expected_in(self, problem: Problem, stated: Collection[str] = ()) -> Problem:
         """Return a problem of new poses with their sigmas by the stated ones and this noise.
 
-        A default sigma becomes the earlier one. Residuals larger than the earlier sigma need not
-        come from the device: the excess is added to a new sigma too.
+        A default sigma becomes the earlier one, unless `stated` names it. Residuals larger than
+        the earlier sigma need not come from the device: the excess is added to a new sigma too.
         """
         found: dict[str, Any] = {}
         for name, sigma in problem.sigmas.items():
             then = self.given.get(name, sigma)
-            if sigma == getattr(Problem, name):
+            if sigma == getattr(Problem, name) and name not in stated:
                 sigma = then
             ratio = 1.0
             if not self.consistent:

@@ -177,11 +177,11 @@ class Recalibration(Shown):
             why = f'something moved while the new poses were measured: {self.step}'
             return why, 'measure again, or give only the poses from there on'
         if not self.explained:
-            step = ANEW
+            step = f'if the device has more noise, state it (--sigma-position); else {ANEW}'
             if self.far:
                 step = (
                     'if the device or the target was moved, give --new-base or --new-tool; check '
-                    f'units, columns and rows of the measurements; else {step}'
+                    f'units, columns and rows of the measurements; else {ANEW}'
                 )
             return 'no change of a few parameters explains the new poses', step
         if not self.determined:

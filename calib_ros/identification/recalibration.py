@@ -59,13 +59,15 @@ def recalibrate(
     years: NotNegative,
     growth: NotNegative = GROWTH,
     new: Sequence[str] = (),
+    stated: Sequence[str] = (),
 ) -> Recalibration:
     """Update a calibration with the poses of a problem.
 
-    The poses are new, between frames of the calibration; the problem has their noise. Since then
-    `years` have passed. `growth` is the standard deviation [m] of the drift of lengths in a year;
-    of angles twice that [rad]. `new` are frames of moved devices and of remounted targets. Raises
-    InputError if the calibration has no covariance or lacks a frame, or for a mistake.
+    The poses are new, between frames of the calibration; the problem has their noise: that of the
+    calibration for default sigmas, unless `stated` names them. Since then `years` have passed.
+    `growth` is the standard deviation [m] of the drift of lengths in a year; of angles twice that
+    [rad]. `new` are frames of moved devices and of remounted targets. Raises InputError if the
+    calibration has no covariance or lacks a frame, or for a mistake.
     """
     previous.require_frames(problem.all_sets)
     previous = _released(previous, new)
@@ -73,6 +75,7 @@ def recalibrate(
     problem = replace(problem, chain=released(problem.chain, ours))
     if mistake := mistakes.diagnose(problem, far=True):
         raise InputError(f'the new poses do not fit the arm: {mistake}')
+    problem = _with_noise(problem, previous, stated)
     try:
         found, arm = _recalibrated(previous, problem, years, growth, new)
     except (np.linalg.LinAlgError, FloatingPointError) as error:  # some are kilometres off
@@ -116,6 +119,10 @@ def _released(previous: Calibration, new: Sequence[str]) -> Calibration:
     return replace(previous, chain=chain, before=before, region=region)
 
 
+def _with_noise(problem: Problem, previous: Calibration, stated: Sequence[str]) -> Problem:
+    return previous.noise.expected_in(problem, stated) if previous.noise else problem
+
+
 def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Problem]]:
     """Yield set and pose with the largest errors by a chain, and the problem without it."""
     sets = problem.all_sets
@@ -139,7 +146,7 @@ def _recalibrated(
 ) -> tuple[Recalibration, Chain]:
     """Return the recalibration, and the earlier arm in new frames."""
     sets = problem.all_sets
-    arm, system = _Arm.of(previous, years, growth), _system(problem, sets, previous)
+    arm, system = _Arm.of(previous, years, growth), System(problem.system(sets).sets)
     # corrected axes are never quite parallel
     nominal = previous.before.with_effects([name for name, _ in arm.chain.effects])
     own = [n for end in new for n in parameters_of(end)]
@@ -325,12 +332,6 @@ class _Arm:
             squares = float(products[-1, -1] + change @ (products[:-1, -1] + information.vector))
             change, covariance = information.mean(self.root)
         return _Found(change, covariance, information, squares)
-
-
-def _system(problem: Problem, sets: Sequence[Observations], previous: Calibration) -> System:
-    if previous.noise is not None:
-        problem = previous.noise.expected_in(problem)
-    return System(problem.system(sets).sets)
 
 
 def _judged(

@@ -81,6 +81,7 @@ def standing(found: Verification) -> tuple[Headline, tuple[str, ...]]:
     state, steps = STANDINGS[found.verdict]
     if found.verdict == 'UNDECIDED' and found.needed is None and not found.outside:
         state, steps = NOISY if found.noise else AT_THE_LIMIT
+        steps = (sentence(found.overstated),) if found.overstated else steps
     if not found.by_program:  # nor whether the correction reaches the arm
         state = replace(state, heading=state.heading.replace('the arm', 'the calibration'))
         steps = tuple(each for each in steps if each != ACTIVE)

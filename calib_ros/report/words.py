@@ -10,7 +10,7 @@ import numpy as np
 
 from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.judgement import Judgement
-from calib_ros.decision.changes import FALSE_ALARM, changes_in_words
+from calib_ros.decision.changes import changes_in_words
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.residuals import ErrorFigures
@@ -177,17 +177,20 @@ def still_holds(updated: Recalibration, found: Judgement) -> tuple[bool, str]:
         return False, verdict_in_words(found)
     if updated.step or updated.changed:  # poses before and after a step look like many changes
         reasons = updated.step or changes_in_words(updated.changed)
+        if not (updated.step or updated.explained):
+            reasons = f'perhaps {reasons}, or the device has more noise (sigma_position)'
         return False, (
             f'the calibration in use no longer fits, {reasons}: was the robot, the target or the '
             f'device bumped? {text}; call ~/clear, measure 8 poses or more, and call ~/identify '
             'or run calib_ros identify --previous'
         )
-    if updated.unexplained <= FALSE_ALARM:
+    if not updated.explained:
         return False, (
             f'{text}, more than the calibration in use and noise explain; no change of a few '
-            'parameters explains it: call ~/clear, measure new poses and call ~/identify'
+            'parameters explains it: if the device has more noise, set sigma_position; else call '
+            '~/clear, measure new poses and call ~/identify'
         )
-    if found.failed:
+    if found.failed or found.overstated:
         return False, verdict_in_words(found)
     return True, f'the calibration in use agrees with the measurements: {text}'
 
@@ -210,6 +213,8 @@ def verdict_in_words(found: Judgement) -> str:
         return f'no verdict: {warning}: measure new ones; {text}'
     if found.verdict == 'UNDECIDED':
         if found.noise and found.needed is None:
+            if found.overstated:
+                return f'no verdict: {found.overstated}; {told}'
             return f'the device has too much noise to tell whether the calibration holds: {told}'
         return f'too few poses to tell whether the calibration holds: {told}; measure more'
     turned = turned_in_words(now)

@@ -314,7 +314,7 @@ class CalibrationNode(Batched):
         self, given: tuple[Calibration, list[Observations], Callable[..., str]]
     ) -> Answer:
         calibration, sets, filed = given
-        sigma = self.session.settings.sigma_position
+        sigma = self.session.settings.given_sigma
         found = judge(calibration, sets, of_messages=True, sigma_position=sigma)
         row = partial(verification_row, calibration.chain, found, kind='validate')
         text = words.verdict_in_words(found) + filed(row, table_hash(calibration.chain))
@@ -324,7 +324,7 @@ class CalibrationNode(Batched):
         calibration, problem = found
         years = years_since(calibration.record, problem.all_sets)
         updated = recalibrate(calibration, problem, years)
-        sets, sigma = problem.all_sets, problem.sigma_position
+        sets, sigma = problem.all_sets, self.session.settings.given_sigma
         now = judge(calibration, sets, of_messages=True, sigma_position=sigma)
         return words.still_holds(updated, now)
 

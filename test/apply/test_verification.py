@@ -20,7 +20,6 @@ from calib_ros.decision.residuals import Residuals
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.report.standing import standing
 from calib_ros.report.verdicts import _by_configuration
-from calib_ros.settings import Settings
 from calib_ros.shown import rounded
 
 _UNIT = ['(mean', '+', '3', 'std)']
@@ -243,26 +242,6 @@ def test_orientations_that_are_far_off_are_told(arm):
         found = verify(arm, [wxyz], tolerance)
         assert found.verdict == 'no verdict'
         assert 'the quaternions are x y z w, not w x y z' in in_words(found)
-
-
-def test_a_device_with_more_noise_does_not_condemn_the_arm(cell, arm):
-    """Its noise alone is beyond the limit; that of the earlier device is not."""
-    noise = 5.0 * NOISE[0]
-    seen = measured(cell[0], UR.random_joints(30, np.random.default_rng(3)), 1, (noise, 1e-3))
-    unsaid, found = verify(arm, [seen], None), verify(arm, [seen], None, sigma_position=noise)
-    assert unsaid.verdict == 'does not hold'
-    assert found.verdict == 'UNDECIDED'
-    assert standing(found)[0].heading == 'UNDECIDED: the device has too much noise to tell'
-    assert verify(arm, [seen], 1e-4, sigma_position=noise).verdict == 'FAIL'  # whatever the cause
-    rows = replace(seen, covariance=np.tile(np.diag([noise**2] * 3 + [1e-6] * 3), (30, 1, 1)))
-    assert verify(arm, [rows], None).verdict == 'UNDECIDED'
-    slipped = cell[0].with_offsets({'elbow_joint.theta': 1.5e-3})
-    moved = measured(slipped, seen.joints, 1, (noise, 1e-3))
-    assert verify(arm, [moved], None, sigma_position=noise).verdict == 'does not hold'
-    few = measured(cell[0], seen.joints, 1)
-    for sigma in (Settings.sigma_position, noise):  # where it decides nothing it is not told
-        same = verify(arm, [few], None, sigma_position=sigma)
-        assert (same.verdict, same.noise) == ('holds', 0.0)
 
 
 def test_a_device_that_stands_elsewhere(cell, arm):

@@ -1,0 +1,77 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The noise of another device: stated or not, and in contradiction to what it measured."""
+
+from dataclasses import replace
+
+import numpy as np
+from verified import NOISE, UR, measured
+
+from calib_ros.apply.judgement import judge
+from calib_ros.apply.verification import verify
+from calib_ros.cli.common import settings_of
+from calib_ros.cli.parser import parser_of
+from calib_ros.estimation.problem import Problem
+from calib_ros.identification.recalibration import recalibrate
+from calib_ros.report.standing import standing
+from calib_ros.report.words import still_holds
+from calib_ros.settings import Settings
+
+
+def test_a_device_with_more_noise_does_not_condemn_the_arm(cell, arm):
+    """Its noise alone is beyond the limit; that of the earlier device is not."""
+    noise = 5.0 * NOISE[0]
+    seen = measured(cell[0], UR.random_joints(30, np.random.default_rng(3)), 1, (noise, 1e-3))
+    unsaid, found = verify(arm, [seen], None), verify(arm, [seen], None, sigma_position=noise)
+    assert unsaid.verdict == 'does not hold'
+    assert found.verdict == 'UNDECIDED'
+    assert standing(found)[0].heading == 'UNDECIDED: the device has too much noise to tell'
+    assert verify(arm, [seen], 1e-4, sigma_position=noise).verdict == 'FAIL'  # whatever the cause
+    rows = replace(seen, covariance=np.tile(np.diag([noise**2] * 3 + [1e-6] * 3), (30, 1, 1)))
+    assert verify(arm, [rows], None).verdict == 'UNDECIDED'
+    slipped = cell[0].with_offsets({'elbow_joint.theta': 1.5e-3})
+    moved = measured(slipped, seen.joints, 1, (noise, 1e-3))
+    assert verify(arm, [moved], None, sigma_position=noise).verdict == 'does not hold'
+    few = measured(cell[0], seen.joints, 1)
+    for sigma in (Settings.sigma_position, noise):  # where it decides nothing it is not told
+        same = verify(arm, [few], None, sigma_position=sigma)
+        assert (same.verdict, same.noise) == ('holds', 0.0)
+
+
+def test_a_stated_noise_may_have_the_value_of_the_default(cell, arm):
+    """It was taken for that of the earlier device, here a better one."""
+    noise, names = (Settings.sigma_position, 4e-4), ('sigma_position', 'sigma_orientation')
+    seen = measured(cell[0], UR.random_joints(60, np.random.default_rng(3)), 1, noise)
+    was = replace(
+        arm.noise, position=1.0, orientation=1.0, given=dict(zip(names, NOISE, strict=True))
+    )
+    known = replace(arm, noise=was, residual=7e-5)
+    assert verify(known, [seen], None).verdict == 'does not hold'
+    assert verify(known, [seen], None, sigma_position=noise[0]).verdict == 'UNDECIDED'
+    found = recalibrate(known, Problem(UR, seen), 0.0)
+    assert 'if the device has more noise, state it (--sigma-position)' in found.refusal()[1]
+    assert (
+        'if the device has more noise, set sigma_position'
+        in still_holds(found, judge(known, [seen]))[1]
+    )
+    assert recalibrate(known, Problem(UR, seen), 0.0, stated=names).accepted
+
+
+def test_an_option_is_known_to_be_given_though_it_has_the_value_of_the_default():
+    given = ['verify', 'new.csv', '--chain', 'ur10e', '--calibration', 'result']
+    for more in ([], ['--sigma-position', '0.0001']):
+        options = parser_of(given).parse_args([*given, *more])
+        assert ('sigma_position' in options) == bool(more)
+        assert settings_of(options) == Settings()
+
+
+def test_noise_that_is_stated_larger_than_all_errors_is_told(cell, arm):
+    """~/check said that a slipped arm agrees."""
+    slipped = cell[0].with_offsets({'elbow_joint.theta': 1.5e-3})
+    seen = measured(slipped, UR.random_joints(30, np.random.default_rng(3)), 1)
+    found = verify(arm, [seen], None, sigma_position=0.01)
+    assert found.verdict == 'UNDECIDED'
+    assert 'contradicts the errors' in standing(found)[1][0]
+    update = recalibrate(arm, Problem(UR, seen, sigma_position=0.01, sigma_orientation=0.01), 0.0)
+    holds, told = still_holds(update, judge(arm, [seen], sigma_position=0.01))
+    assert (holds, 'contradicts the errors' in told) == (False, True)
