@@ -66,14 +66,15 @@ class Change:
     pair: tuple[str, ...] = ()  # the joints if two changed
 
     def __str__(self) -> str:
+        asked = 'was it bumped' + ', or does it creep' * (self.seen > self.time) + '?'
         if self.pair:
-            return f'two joints changed: {" and ".join(self.pair)}: was it bumped?'
+            return f'two joints changed: {" and ".join(self.pair)}: {asked}'
         if not self.reasons:
             return (
                 'several joints changed: was the robot repaired, or are these the measurements of '
                 'another robot?'
             )
-        return f'{reason_in_words(self.reasons)}: was it bumped?'
+        return f'{reason_in_words(self.reasons)}: {asked}'
 
     @property
     def alone(self) -> dict[tuple[Parameter, float], float]:

@@ -179,10 +179,12 @@ def still_holds(updated: Recalibration, found: Judgement) -> tuple[bool, str]:
         reasons = updated.step or changes_in_words(updated.changed)
         if not (updated.step or updated.explained):
             reasons = f'perhaps {reasons}, or the device has more noise (sigma_position)'
+        creeps = updated.step is not None and updated.step.slow
+        asked = 'does {} give way?' if creeps else 'was {} bumped?'
         return False, (
-            f'the calibration in use no longer fits, {reasons}: was the robot, the target or the '
-            f'device bumped? {text}; call ~/clear, measure 8 poses or more, and call ~/identify '
-            'or run calib_ros identify --previous'
+            f'the calibration in use no longer fits, {reasons}: '
+            f'{asked.format("the robot, the target or the device")} {text}; call ~/clear, measure '
+            '8 poses or more, and call ~/identify or run calib_ros identify --previous'
         )
     if not updated.explained:
         return False, (

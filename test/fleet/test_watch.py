@@ -141,7 +141,7 @@ def test_changes_of_one_parameter_in_one_direction_are_told_as_creep(first, rng)
     told = list(alarms_of(changes))
     assert len(changes) > len(told) == 2
     assert 'wrist_2_joint.alpha by' in told[0]
-    assert told[0].endswith('was it bumped?')
+    assert told[0].endswith('was it bumped, or does it creep?')  # seen after some nights
     assert re.fullmatch(
         r'2025-10-\d\d: elbow_joint.theta creeps: by \+0.[45]\d+ mrad in .*', told[1]
     )
