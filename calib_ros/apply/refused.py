@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.apply.compensator import Compensation, Compensator, Refusal
-from calib_ros.kinematics.limits import a_turn_away
+from calib_ros.kinematics.limits import a_turn_away, beyond, limits
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import EXACT, TURN_IN_PART
 from calib_ros.shown import rounded
@@ -19,20 +19,27 @@ from calib_ros.shown import rounded
 def outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
     """Return the samples outside the region of the calibration."""
     region = compensator.region
-    if region is None or region.whole:
+    if region is None:
         return []
-    errors = region.known(result.command)
-    far = np.flatnonzero(errors > region.limit)
-    share = 100.0 * len(far) / len(errors)
-    return [
-        Refusal(
-            k,
-            f'the calibration is not valid in {share:.0f} % of the program, as here: the '
-            f'expected error by its parameters, {rounded(1e3 * errors[k])} mm, exceeds the limit '
-            f'of {rounded(1e3 * region.limit)} mm; identify again with poses near it',
+    far = np.flatnonzero(~region.covers(result.command))
+    share = 100.0 * len(far) / len(result.command)
+    where = f'the calibration is not valid in {share:.0f} % of the program, as here'
+    found, joints = [], result.command[far]
+    every = zip(far.tolist(), region.known(joints), beyond(joints, region.chain), strict=True)
+    for k, error, which in every:
+        why = (
+            f'the expected error by its parameters, {rounded(1e3 * error)} mm, exceeds the limit '
+            f'of {rounded(1e3 * region.limit)} mm'
         )
-        for k in far.tolist()
-    ]
+        if which.any():
+            i = int(which.argmax())
+            lower, upper = (end[i] for end in limits(region.chain))
+            why = (
+                f'{result.command[k, i]:.6g} of {compensator.nominal.joint_names[i]} is beyond '
+                f'the limits for which it was identified, {lower:.6g} to {upper:.6g}'
+            )
+        found.append(Refusal(k, f'{where}: {why}; identify again with poses near it'))
+    return found
 
 
 def unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
@@ -45,19 +52,19 @@ def unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
     apart, most = result.position, compensator.largest_position_error
     if most is None:
         apart, most = result.reachable, EXACT
-    beyond = (command < follower.lower - EXACT) | (command > follower.upper + EXACT)
+    outer = (command < follower.lower - EXACT) | (command > follower.upper + EXACT)
     too_large = np.abs(correction) > compensator.largest
     remaining = (apart > most) | (result.orientation > tolerated)
     # a redundant arm may oscillate among solutions, all correct, one in part among orientations
     away = (result.reachable > EXACT) | (follower.complete & (result.orientation > EXACT))
     astray = ~result.converged & away
-    wrong = beyond.any(axis=1) | too_large.any(axis=1) | remaining | astray
+    wrong = outer.any(axis=1) | too_large.any(axis=1) | remaining | astray
     largest = f'{compensator.largest_turn:g} rad or {compensator.largest_shift:g} m'
     found = []
     for k in np.flatnonzero(wrong).tolist():
         left = f'{1e3 * result.position[k]:.4f} mm and {1e3 * result.orientation[k]:.4f} mrad'
-        if beyond[k].any():
-            i = int(beyond[k].argmax())
+        if outer[k].any():
+            i = int(outer[k].argmax())
             reason = (
                 f'the command {command[k, i]:.6g} of {names[i]} is beyond its limits '
                 f'{follower.lower[i]:.6g} to {follower.upper[i]:.6g} (rad or m; in degrees only '

@@ -61,7 +61,9 @@ class Search:
         expected = self._arm.expected(joints[reached].reshape(-1, joints.shape[-1]), self._model)
         expected = expected.reshape(-1, len(self._task))
         errors[reached] = expected.mean(axis=1) if self._aim == 'mean' else expected.max(axis=1)
-        best = np.where(np.isnan(errors), np.inf, errors).argmin(axis=1)
+        turning = [joint.type == 'revolute' for joint in self._chain.joints]
+        turned = (np.abs(np.diff(joints[..., turning], axis=2)) > np.pi).any(axis=(2, 3))
+        best = np.lexsort((errors, turned, np.isnan(errors)))[:, 0]
         index = np.arange(len(placements))
         return errors[index, best], joints[index, best]
 

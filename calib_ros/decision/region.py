@@ -15,6 +15,7 @@ from calib_ros.errors import UnknownNameError
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.limits import beyond
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.shown import Shown
@@ -27,9 +28,9 @@ class Region(Shown):
     `chain` is the calibrated arm with considered effects, `square` (P, P) the expected squares of
     the errors of its parameters `names` for the measuring device; another device adds `device` (P,
     K) times its transpose. Predicted positions may be off by `limit` [m], infinite if the whole
-    joint range is used; `share` is the used share of it. It was measured between `base` and
-    `tool`. `by_scale`, unknown for a loaded region, is the probability that the device is out of
-    scale and makes the arm worse there.
+    joint range is used, within the limits of `chain`; `share` is the used share of it. It was
+    measured between `base` and `tool`. `by_scale`, unknown for a loaded region, is the probability
+    that the device is out of scale and makes the arm worse there.
     """
 
     chain: Chain
@@ -55,7 +56,9 @@ class Region(Shown):
 
     def covers(self, joints: FloatArray) -> Flags:
         """Tell (N,) whether the calibration may be used at joint values (N, n)."""
-        return np.asarray(self.known(joints) <= self.limit)
+        joints = self.chain.joint_values(joints)
+        inside = np.asarray(~beyond(joints, self.chain).any(axis=1))
+        return inside if self.whole else inside & (self.known(joints) <= self.limit)
 
     @property
     def whole(self) -> bool:

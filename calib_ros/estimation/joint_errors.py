@@ -157,4 +157,4 @@ def wobble_columns(tilts: FloatArray, joints: FloatArray) -> FloatArray:
     angles = np.multiply.outer(joints.T, (1.0, 2.0))  # (n, N, 2)
     waves = np.concatenate([np.cos(angles), np.sin(angles)], axis=2).repeat(2, axis=0)
     found = tilts[:, np.newaxis] * waves.transpose(0, 2, 1)[:, :, np.newaxis]
-    return np.asarray(found.reshape(-1, *tilts.shape[1:]))
+    return np.asarray(found.reshape(4 * len(tilts), *tilts.shape[1:]))

@@ -55,6 +55,7 @@ from calib_ros.kinematics.chain_file import (
     table_hash,
 )
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.limits import narrowed
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import Model, Settings
 from calib_ros.shown import Shown, rounded
@@ -304,9 +305,8 @@ class Calibration(Shown):
             return '', ''
         shift, turn = self.sigma(joints), self.sigma(joints, np.s_[3:])
         words = (
-            'standard deviation of these poses: at most '
-            f'{rounded(1e3 * shift.max())} mm at the target measured and '
-            f'{rounded(1e3 * turn.max())} mrad'
+            f'standard deviation of these poses: at most {rounded(1e3 * shift.max())} mm at the '
+            f'target measured and {rounded(1e3 * turn.max())} mrad'
         )
         if np.sum(turn**2) <= np.sum(turned**2):
             return words, ''
@@ -369,7 +369,7 @@ def parse_calibration(
     agree with a given nominal chain. With settings, the parameters may differ from it by at most
     `largest_length` and `largest_angle`; without, the recorded identification has judged that.
     Without a nominal chain the recorded one is used; without recorded frames, those closest to the
-    corrected arm.
+    corrected arm. Joints keep the limits of the file and of the nominal chain.
 
     Raises ConfigError if the text is no chain file, has no record, was not accepted, or was
     identified from another nominal chain.
@@ -384,8 +384,8 @@ def parse_calibration(
     names, covariance, freedom, unmodelled = record.covariance(chain)
     residual = content.get('rms_mm_after')
     return Calibration(
-        chain=chain,
-        before=record.before(nominal, chain),
+        chain=narrowed(chain, nominal),
+        before=narrowed(record.before(nominal, chain), chain),
         names=names,
         covariance=covariance,
         unmodelled=unmodelled,

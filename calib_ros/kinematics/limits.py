@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import TWO_TURNS
 from calib_ros.kinematics.effects import coupled
 from calib_ros.kinematics.joint import Joint
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray
 
 
 def limits(chain: Chain) -> tuple[FloatArray, FloatArray]:
@@ -28,6 +29,24 @@ def limits(chain: Chain) -> tuple[FloatArray, FloatArray]:
         np.array([-np.inf if lower is None else lower for lower, _ in ends]),
         np.array([np.inf if upper is None else upper for _, upper in ends]),
     )
+
+
+def beyond(values: FloatArray, chain: Chain) -> Flags:
+    """Tell (N, n) which joint values (N, n) are 1e-3 [rad or m] beyond their limits."""
+    lower, upper = limits(chain)
+    return (values < lower - 1e-3) | (values > upper + 1e-3)
+
+
+def narrowed(chain: Chain, other: Chain) -> Chain:
+    """Return a chain whose joints keep the limits of another one, too."""
+    pairs = zip(chain.joints, other.joints, strict=True)
+    ends = [((a.lower, b.lower), (a.upper, b.upper)) for a, b in pairs]
+    given = [[[end for end in both if end is not None] for both in each] for each in ends]
+    joints = tuple(
+        replace(joint, lower=max(lower, default=None), upper=min(upper, default=None))
+        for joint, (lower, upper) in zip(chain.joints, given, strict=True)
+    )
+    return replace(chain, joints=joints)
 
 
 def a_turn_away(joint: Joint, value: float) -> str:
@@ -49,8 +68,7 @@ def check_limits(
     """Refuse joint values (N, n) 1e-3 beyond their limits, or as `check_turns`."""
     check_turns(values, chain, where)
     lower, upper = limits(chain)
-    beyond = (values < lower - 1e-3) | (values > upper + 1e-3)
-    for k, i in np.argwhere(beyond)[:1].tolist():
+    for k, i in np.argwhere(beyond(values, chain))[:1].tolist():
         raise InputError(
             f'{where(k, i)}{values[k, i]:.6g} is beyond the limits of {chain.joint_names[i]}, '
             f'{lower[i]:.6g} to {upper[i]:.6g} (rad or m{remedy(i)})'

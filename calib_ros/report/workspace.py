@@ -84,13 +84,15 @@ def placed_in_words(placed: Placements) -> str:
     """Return where to put a task, compared with the centre of all places and the worst."""
     errors = 1e3 * placed.errors
     reached = ~np.isnan(errors)
+    moves = np.abs(np.diff(placed.joints[placed.best], axis=0))
     where = ', '.join(f'{value:.3f}' for value in placed.positions[placed.best])
     return (
         f'Best at x, y, z = {where} m, {np.degrees(placed.turns[placed.best]):.0f}° about the '
         f'vertical: {rounded(errors[placed.best])} mm; in the centre of the region '
         f'{rounded(errors[placed.centre])} mm, at the worst place '
         f'{rounded(errors[reached].max())} mm. {int(reached.sum())} of {len(reached)} places can '
-        'be reached.'
+        f'be reached. From pose to pose no joint moves by more than {moves.max(initial=0.0):.2f} '
+        'rad or m.'
     )
 
 

@@ -258,6 +258,22 @@ def test_the_calibration_of_another_robot_is_refused():
     assert in_words(Compensator(UR, other), result) == '0 of 20 points corrected'
 
 
+def test_a_calibration_is_used_within_the_limits_for_which_it_was_identified(arm):
+    """Those of a controller may be wider; the whole joint range was that of the calibration."""
+    q = regular(arm.chain, 4)
+    ends = [(float(low), float(high)) for low, high in zip(q[0] - 0.1, q[0] + 0.1, strict=True)]
+    rows = zip(arm.chain.joints, ends, strict=True)
+    inner = tuple(replace(joint, lower=low, upper=high) for joint, (low, high) in rows)
+    known = replace(arm.region.chain, joints=inner)
+    region = replace(arm.region, chain=known, limit=np.inf)
+    result = compensate(Compensator(bare(UR), arm.chain, region=region), q)
+    assert [each.sample for each in result.refusals] == [1, 2, 3]
+    low, high = ends[0]
+    told = f'not valid in 75 % of the program, as here: {q[1, 0]:.6g} of shoulder_pan_joint is '
+    told += f'beyond the limits for which it was identified, {low:.6g} to {high:.6g}; identify'
+    assert told in result.refusals[0].reason
+
+
 def test_a_jump_of_the_correction_is_refused():
     q = regular(UR, 1) + np.linspace(0.0, 0.01, 101)[:, None]
     slack = UR_TRUE.with_effect_values({'elbow_joint.backlash': 5e-4})

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 from argparse import Namespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from calib_ros.apply.task import task_of
 from calib_ros.apply.workspace import in_base
 from calib_ros.cli.workspace import _task
 from calib_ros.errors import CalibrationError, ConfigError, InputError
+from calib_ros.estimation.joint_errors import Unmodelled
 from calib_ros.kinematics.chain import Joint
 from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.se3 import exp_rotation, transform
@@ -146,6 +148,27 @@ def test_a_task_out_of_reach_is_refused(arm):
     for x, said in ((0.2, 'give the lower corner first'), (np.nan, 'region must not hold NaN')):
         with pytest.raises(CalibrationError, match=said):
             place(arm, TASK, region=np.array([[0.3, -1.0, 0.0], [x, 1.0, 1.0]]))
+
+
+def test_out_of_reach_nothing_is_expected_of_axes_that_wobble(arm):
+    """No joint values at all ended in an error of numpy."""
+    names, count = arm.region.names, 8 * len(arm.chain.joints)
+    waves = Unmodelled(waves=1e-4, names=names, followed=np.zeros((len(names), count)))
+    wobbling = replace(arm, unmodelled=waves)
+    far = TASK + np.pad([[10.0]], ((0, 3), (3, 0)))
+    with pytest.raises(InputError, match='cannot reach all 6 poses of the task in any'):
+        place(wobbling, far, cells=2)
+
+
+def test_no_joint_turns_back_from_pose_to_pose_if_it_need_not(arm):
+    """A tool that turns once about its axis: at some starts the wrist was turned back by 2 pi."""
+    turns = np.linspace(0.0, 2.0 * np.pi, 14)[:, np.newaxis] * [0.0, 0.0, 1.0]
+    task = transform(DOWN @ exp_rotation(turns), np.zeros((14, 3)))
+    region = np.array([[0.4, -0.4, 0.0], [0.8, 0.4, 0.4]])
+    found = place(arm, task, region=region, cells=2, refinements=0)
+    moves = np.abs(np.diff(found.joints[~np.isnan(found.errors)], axis=1))
+    assert len(moves) > 3
+    assert moves.max() < np.pi
 
 
 def test_a_task_from_a_box_of_joint_values_is_reached_where_it_came_from(arm):

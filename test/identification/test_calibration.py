@@ -55,6 +55,17 @@ def test_in_sockets_it_holds_up_to_its_former_error():
     assert found.limit(problem.sets, 2.0) == found.limit() == ALIKE * found.residual
 
 
+def test_joints_keep_the_limits_of_the_file_and_of_the_nominal_chain(found):
+    """A task was placed beyond the limits of --chain, since only those of the file were kept."""
+    free, held, other = UR.joints[0].lower, -1.0, {'lower': -1.0, 'upper': None}
+    joints = (UR.joints[0], *(replace(joint, **other) for joint in UR.joints[1:]))
+    again = parse_calibration(found.dump(), 'file', replace(UR, joints=joints))
+    for chain in (again.chain, again.before):
+        assert [joint.lower for joint in chain.joints] == [free, *[held] * 5]
+        assert [joint.upper for joint in chain.joints] == [joint.upper for joint in UR.joints]
+    assert again.region.chain.joints[1].lower == UR.joints[1].lower
+
+
 @pytest.fixture(scope='module')
 def document(found):
     """Return what its file holds, without the region, which takes long to read."""
