@@ -109,7 +109,10 @@ def parameter_rows(fitted: Fitted, uncertainty: Uncertainty) -> tuple[ParameterR
     """Return every parameter of a fitted chain, with its standard deviation if fitted."""
     problem, chain, names = fitted.problem, fitted.chain, fitted.names
     change = _value_jacobian(chain, names)
-    variances = np.einsum('vp,kpr,vr->kv', change, uncertainty.parts, change, optimize=True)
+    turned = np.flatnonzero((change != np.eye(len(names))).any(axis=1))
+    variances = np.einsum('kpp->kp', uncertainty.parts).copy()
+    along = change[turned] @ uncertainty.parts
+    variances[:, turned] = np.einsum('kvp,vp->kv', along, change[turned])
     std = dict(zip(names, np.sqrt(variances.sum(axis=0)).tolist(), strict=True))
     freedom = dict(zip(names, uncertainty.freedom_of(variances).tolist(), strict=True))
     free = set(problem.free)

@@ -127,14 +127,17 @@ class Samples:
         """Yield the weighted rows by position and orientation, (P + 1, c, B) each, in blocks.
 
         Derivatives by the parameters in the order of their names, the residual last. Without a
-        separate orientation there is one part.
+        separate orientation there is one part. The next block may take the memory of the last.
         """
         model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
+        order, found = np.append(model.order, model.motions), tuple[FloatArray, ...]()
         for motions, phi in self._motions(model):
-            parts = tuple(rows[[*model.order, -1]] for rows in motions)
-            for rows in parts:
-                rows[model.spread] *= phi[:, np.newaxis]
-            yield parts
+            if not found or found[0].shape[2] != phi.shape[1]:
+                found = tuple(np.empty((len(order), *rows.shape[1:])) for rows in motions)
+            for rows, own in zip(motions, found, strict=True):
+                rows.take(order, axis=0, out=own, mode='clip')
+                model.multiply(own, phi)
+            yield found
 
     def _motions(self, model: ErrorModel) -> Iterator[tuple[tuple[FloatArray, ...], FloatArray]]:
         """Yield blocks of `parts` by motion, (M + 1, c, B), and phi (E, B) of the effects."""

@@ -195,7 +195,7 @@ class LinearModel:
     def _add(self, columns: FloatArray) -> None:
         """Add columns (K, R) and their products with all, by fold of each dealing."""
         count = len(self._columns)
-        self._columns = np.concatenate([self._columns, columns[:, self._order]])
+        self._columns = np.concatenate([self._columns, columns.take(self._order, axis=1)])
         grown = (0, 0), (0, len(columns)), (0, len(columns))
         self._products = [np.pad(each, grown) for each in self._products]
         begins = np.flatnonzero(np.diff(self._folds, prepend=-1).any(axis=0))

@@ -57,7 +57,7 @@ class ErrorModel:
         self.names = tuple(names)
         self.ends = (base, tool)
         self._base = chain.frame(base).matrix
-        self._origin = np.vstack([np.eye(3), self._base[:3, 3]])[..., np.newaxis]
+        self._origin = np.append(np.eye(3), self._base[:3, 3]).reshape(4, 3, 1)
         turning = tuple(bool(turns) for turns in chain.walk.turning)
         known = dict(chain.effects)
         fitted = tuple(name for name in self.names if name in known)
@@ -161,8 +161,14 @@ class ErrorModel:
         found = np.zeros((len(self.names), 6, shift.shape[2]))
         turning = self.order < self.rotations
         found[:, :3], found[turning, 3:] = shift[self.order], turn[self.order[turning]]
-        found[self.spread] *= phi[:, np.newaxis]
+        self.multiply(found, phi)
         return found
+
+    def multiply(self, rows: FloatArray, phi: FloatArray) -> None:
+        """Multiply those of the rows (P, c, B) that belong to effects by their phi (E, B)."""
+        own = self.spread
+        together = len(own) > 0 and own[-1] - own[0] == len(own) - 1  # a slice makes no copy
+        rows[slice(own[0], own[-1] + 1) if together else own] *= phi[:, np.newaxis]
 
 
 class _Layout(NamedTuple):
