@@ -13,7 +13,6 @@ import re
 import typing
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import is_dataclass
 from functools import cache, partial, wraps
 from numbers import Integral, Real
 from types import NoneType, UnionType
@@ -124,8 +123,8 @@ def _read_only(made: Any) -> Any:
         made.flags.writeable = False
     elif type(made) is tuple:
         return tuple(map(_read_only, made))
-    elif is_dataclass(made) and not hasattr(made, '__post_init__'):
-        for name in made.__dataclass_fields__:
+    elif not hasattr(made, '__post_init__'):
+        for name in getattr(made, '__dataclass_fields__', ()):
             if (found := _read_only(value := getattr(made, name))) is not value:
                 object.__setattr__(made, name, found)
     return made

@@ -71,20 +71,24 @@ def group_of(name: str) -> str:
 
 def members(chain: _Arm, group: str) -> tuple[Parameter, ...]:
     """Return the names of all effects of a group for a chain."""
-    names, wrist = chain.joint_names, chain.joint_names[-3:]
-    revolute = [joint.name for joint in chain.joints if joint.type == 'revolute']
-    geared = [(joint.name, joint.gear_ratio) for joint in chain.joints if joint.gear_ratio]
+    joints = ((each.name, each.type == 'revolute', each.gear_ratio) for each in chain.joints)
+    return _members(tuple(joints), group)
+
+
+@lru_cache(maxsize=256)
+def _members(joints: tuple[tuple[str, bool, float], ...], group: str) -> tuple[Parameter, ...]:
+    names, revolute = [name for name, *_ in joints], [name for name, turns, _ in joints if turns]
+    geared = [(name, gear) for name, _, gear in joints if gear]
     links = [(name, end) for k, name in enumerate(names) for end in names[k:] if name in revolute]
     found: dict[str, list[Parameter]] = {
         'ratio': [Parameter(name, group) for name in names],
-        'coupling': couplings(wrist),
+        'coupling': couplings(names[-3:]),
         'eccentricity': [wave for name in revolute for k in (1, 2) for wave in waves(name, k)],
         'gear': [wave for name, gear in geared for k in (1, 2) for wave in waves(name, k * gear)],
         'gravity': [Parameter(name, f'gravity_{end}') for name, end in links],
         'compliance': [Parameter(name, group) for name in revolute],
         'backlash': [
-            Parameter(joint.name, group if joint.type == 'revolute' else 'play')
-            for joint in chain.joints
+            Parameter(name, 'backlash' if turns else 'play') for name, turns, _ in joints
         ],
     }
     return tuple(found[group])
@@ -206,13 +210,18 @@ def couple_held(
 
 def moved_joints(chain: _Arm, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
     """Return joint values (n, B) plus effects with phi (E, B); of held joints their limit."""
-    known = dict(chain.effects)
-    values = [known[name] for name in names]
     q = couple_held(chain, q, couplings=False)
-    shares = np.zeros((len(q), len(names)))
-    driven = [chain.joint_names.index(Parameter(name).owner) for name in names]
-    shares[driven, np.arange(len(names))] = values
+    if not names:
+        return q
+    known, shares = dict(chain.effects), np.zeros((len(q), len(names)))
+    driven = _driven(tuple(names), chain.joint_names)
+    shares[driven, np.arange(len(names))] = [known[name] for name in names]
     return np.asarray(q + shares @ phi)
+
+
+@lru_cache(maxsize=256)
+def _driven(names: tuple[str, ...], joint_names: tuple[str, ...]) -> Index:
+    return np.array([joint_names.index(Parameter(name).owner) for name in names])
 
 
 @lru_cache(maxsize=256)

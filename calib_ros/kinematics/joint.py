@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -132,9 +132,15 @@ class Frame:
 
     def offsets(self, reference: Frame | None = None) -> FloatArray:
         """Return the move (6,) from `reference`: x, y, z [m] and a rotation vector [rad]."""
-        start = (reference or ANYWHERE).matrix
-        turn = se3.log_rotation(self.matrix[:3, :3] @ start[:3, :3].T)
-        return np.concatenate([self.matrix[:3, 3] - start[:3, 3], turn])
+        return _move(self, reference or ANYWHERE)
+
+
+@lru_cache(maxsize=16)
+def _move(frame: Frame, start: Frame) -> FloatArray:  # asked for by each of its parameters
+    turn = se3.log_rotation(frame.matrix[:3, :3] @ start.matrix[:3, :3].T)
+    found = np.concatenate([frame.matrix[:3, 3] - start.matrix[:3, 3], turn])
+    found.setflags(write=False)
+    return found
 
 
 ANYWHERE = Frame()
