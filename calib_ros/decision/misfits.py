@@ -117,9 +117,16 @@ def coupling_share(fitted: Fitted) -> float:
 
 
 def explained_share(
-    problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str]
+    problem: Problem,
+    chain: Chain,
+    fitted: Sequence[str],
+    added: Sequence[str],
+    sets: Sequence[Observations] = (),
 ) -> float:
-    """Return the share of the residual squares that added parameters explain, linearly."""
-    few = [each.spread() for each in problem.sets]
+    """Return the share of the residual squares that added parameters explain, linearly.
+
+    Of the problem's sets, or of others.
+    """
+    few = [each.spread() for each in sets or problem.sets]
     rows = problem.system(few).rows_of(chain, (*fitted, *added))
     return gain_share(stacked(rows), len(fitted))

@@ -264,7 +264,7 @@ def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | 
     sets = [*map(_with_moves, problem.sets)]
     few = [each.spread() for each in sets]
     shares = [
-        explained_share(problem.with_sets(some), chain, names, delays)
+        explained_share(problem, chain, names, delays, some)
         for some in (few, [_straight(chain, each) for each in few])
     ]
     if (share := max(shares)) < EXPLAINED:
@@ -295,7 +295,7 @@ def _with_moves(each: Observations) -> Observations:
     moves[order[1:]] = np.diff(joints[order], axis=0)
     moves = moves[each.images]
     signs = np.sign(moves) if each.approach is None else each.approach
-    return replace(each, velocity=moves, approach=signs, delay=np.zeros(len(each)))
+    return each.changed(velocity=moves, approach=signs, delay=np.zeros(len(each)))
 
 
 def _straight(chain: Chain, each: Observations) -> Observations:
@@ -305,7 +305,7 @@ def _straight(chain: Chain, each: Observations) -> Observations:
     place, axes = there[:, :3, 3].T, there[:, :3, :3].transpose(2, 1, 0)
     error, slopes = Aim(chain, *ends).linearise(each.joints.T, None, place, axes, LEVER)
     back = np.linalg.pinv(slopes[:, part].T, DEGENERATE)
-    return replace(each, velocity=-np.einsum('bip,pb->bi', back, error[part]))
+    return each.changed(velocity=-np.einsum('bip,pb->bi', back, error[part]))
 
 
 def _sigmas(problem: Problem, result: Identification) -> str:

@@ -211,9 +211,10 @@ class Problem(Shown):
     def model(self) -> Chain:
         """Return the nominal chain with all frames and effects to fit."""
         chain = self.chain
-        known = dict(chain.frames)
         added = {n for each in self.sets for n in (each.base, each.tool)} - set(chain.frame_names)
-        chain = replace(chain, frames=tuple((known | dict.fromkeys(sorted(added))).items()))
+        if added:  # else it keeps what it knows of itself
+            new = ((name, None) for name in sorted(added))
+            chain = replace(chain, frames=(*chain.frames, *new))
         for each in self.sets:
             device = chain.frame(each.base)
             if each.moving and device.delay is None:

@@ -61,7 +61,7 @@ def start_frames(problem: Problem) -> Chain:
         known = {**chain.all_frames, **placed}
         base, tool = observations.base, observations.tool
         view = replace(chain, base=known[base], tool=known[tool])
-        alone = replace(observations, base='base', tool='tool')
+        alone = observations.changed(base='base', tool='tool')
         if alone.pixels is not None:
             lens = require_lens(view.frame(alone.camera).lens, alone.camera)
             alone = board_poses(alone.some_images(), lens)

@@ -233,14 +233,15 @@ class Chain(Shown):
 
     def with_effects(self, names: Sequence[str]) -> Chain:
         """Return the chain with further effects of value zero."""
-        known = dict(self.effects)
-        added = tuple((name, 0.0) for name in dict.fromkeys(names) if name not in known)
-        for name, _ in added:
+        added = [name for name in dict.fromkeys(names) if name not in self._effect_values]
+        if not added:
+            return self
+        for name in added:
             if name.partition('.')[0] not in self._joints:
                 raise UnknownNameError('parameter', name, self.parameter_names)
             effects.resolve(self, name)
         kept = ('joint_names', 'frame_names', 'walk', 'all_frames', '_joints', 'held')
-        return _with(self, {'effects': (*self.effects, *added)}, kept)
+        return _with(self, {'effects': (*self.effects, *((name, 0.0) for name in added))}, kept)
 
     def with_effect_values(self, values: Mapping[str, float]) -> Chain:
         """Return the chain with effects of given values."""

@@ -25,6 +25,13 @@ def test_measurements_of_an_arm_with_other_joints_are_refused():
         Problem(UR10E, five)
 
 
+def test_without_further_frames_or_effects_the_model_is_the_chain():
+    """So what the chain found out about itself serves every problem."""
+    assert Problem(UR10E, SEEN).model is UR10E
+    further = Problem(UR10E, SEEN, more=[replace(SEEN, tool='tool_2')]).model
+    assert further.frame_names == (*UR10E.frame_names, 'tool_2')
+
+
 def test_a_joint_that_cannot_move_must_not_have_moved():
     held = replace(UR10E.joints[2], lower=0.5, upper=0.5)
     arm = replace(UR10E, joints=(*UR10E.joints[:2], held, *UR10E.joints[3:]))
