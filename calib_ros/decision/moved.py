@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.observations import Observations
@@ -16,7 +16,8 @@ ZERO = 'zero'  # of the distances of a device
 FRAMES = ('base', 'tool')
 IN_THE_CELL = (*FRAMES, ZERO)  # beside the arm
 ZEROS = ('joint', ZERO)
-FROM_THERE, BEFORE_THAT = 'from there on', 'before that'
+FROM_THERE, BEFORE_THAT, ASIDE = 'from there on', 'before that', 'with it elsewhere'
+IF_IN_ORDER = ' (if rows are in the order of measurement)'
 RELEASE = 'correct it, or remove fixed: true there'
 """What to do with a frame that the chain file holds in a wrong place."""
 OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
@@ -30,10 +31,10 @@ class Step:
     'tool', 'zero', 'joint', 'joints' or 'load'), of these `owners`; `thing` names the device or
     target there. `set`, `sample` and `stamp_ns` belong to the first sample after the step, which a
     reader finds at `where`. `size` is the RMS change of positions ('m') or, if that weighs more,
-    orientations ('rad'); of a zero its own. `share` is its share of the squared residuals beyond
-    that of as many useless parameters. If all measurements on one side are outliers, `unused` says
-    which: the fit of frames is not affected. If the arm's places before and after lie `apart`, its
-    errors may look like a step of that size.
+    orientations ('rad'); of a zero its own, with its sign. `share` is its share of the squared
+    residuals beyond that of as many useless parameters. If all measurements on one side are
+    outliers, `unused` says which: the fit of frames is not affected. If the arm's places before
+    and after lie `apart`, its errors may look like a step of that size.
     """
 
     owners: tuple[str, ...]
@@ -54,6 +55,8 @@ class Step:
     """Whether it crept over the whole session."""
     longer: Mapping[str, float] = field(default_factory=dict)
     """By how much [m] the distances of devices are longer from there on, if their zeros moved."""
+    later: tuple[Step, ...] = ()
+    """Further steps of the same owners."""
 
     @property
     def what(self) -> str:
@@ -75,7 +78,18 @@ class Step:
 
     @property
     def _size(self) -> str:
-        return f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
+        """Return the size in words; only of several with its sign."""
+        size = self.size if self.later else abs(self.size)
+        return f'by {float(f"{1e3 * size:.2g}"):g} m{self.unit}'
+
+    @property
+    def _where(self) -> str:
+        """Return where it moved, and where by how much again."""
+        text = self.where.removesuffix(IF_IN_ORDER)
+        for each in self.later:
+            by = f'{replace(each, later=(self,))._size} ' * (self.kind not in OF_THE_ARM)
+            text += f', {by}before {each.where.removesuffix(IF_IN_ORDER)}'
+        return text + IF_IN_ORDER * self.where.endswith(IF_IN_ORDER)
 
     @property
     def _are(self) -> str:
@@ -97,7 +111,7 @@ class Step:
         if self.kind in OF_THE_ARM:
             return f'{OF_THE_ARM[self.kind]} changed before pose {number}{again}'
         what = f'the zero of {self.what}' if self.kind in ZEROS else self.what
-        moved = f'moved {self._size} before pose {number}'
+        moved = f'moved {self._size} before pose {number}' + ' and later again' * bool(self.later)
         if self.outdated:
             return f'{what} {moved} and {self._are} outdated{again}'
         return f'{what} {moved}' + again * self.harmful
@@ -112,18 +126,18 @@ class Step:
         thing, of = self.thing, f' ({self.what})'
         if self.kind in ZEROS:
             thing, of = f'the zero of {self.what}', ''
-        text, more = f'{thing} moved {size}{of} before {self.where}', ''
+        text, more = f'{thing} moved {size}{of} before {self._where}', ''
         if self.slow:
             text = f'{thing} seems to have moved slowly, {size} over the session{of}'
             more = '; if the poses follow an order, errors of the arm may look so: mix them'
         elif self.kind in OF_THE_ARM:
-            text, more = f'{thing} changed before {self.where}', f': poses differ {size}'
+            text, more = f'{thing} changed before {self._where}', f': poses differ {size}'
         if self.kind == 'load':
             more += '; measure with one load, or fit only the poses before or only those after'
         if self.unused:
             more += f'; measurements {self.unused} carry no weight'
             more += f': {self.what} {self._are} outdated, measure again' * self.outdated
-        if self.longer and not self.slow:
+        if self.longer and not (self.slow or self.later):
             more += f'; {self._correction}'
         if self.apart:
             more += (
@@ -144,7 +158,7 @@ def place_of(problem: Problem, number: int, sample: int) -> str:
         return f'{where} (stamp {stamp})'
     line = rows_in_words([sample], seen.stamps_ns)
     where = line if seen.pixels is None else f'{where}, {line}'
-    return f'{where} (if rows are in the order of measurement)'
+    return f'{where}{IF_IN_ORDER}'
 
 
 def thing_of(kind: str, seen: Observations, several: bool = False) -> str:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from calib_ros.decision.moved import BEFORE_THAT, FROM_THERE, Step
+from calib_ros.decision.moved import ASIDE, BEFORE_THAT, FROM_THERE, IF_IN_ORDER, Step
 from calib_ros.decision.reasons import Rule
 
 AGAIN = ', measure again after ~/clear'
@@ -15,6 +15,7 @@ FRAME = Step(('base',), 'base', 'the device', 0, 4, 0, SIZE, 'm', 0.3, '', 'row 
 JOINT = replace(FRAME, owners=('elbow_joint',), kind='joint', thing='the joint', unit='rad')
 LOAD = replace(FRAME, owners=('the load',), kind='load', thing='the load of the arm')
 WIRES = {'wire': 2e-3, 'other': -1e-3}
+LATER = replace(FRAME, where=f'line 9{IF_IN_ORDER}'), replace(FRAME, size=-2e-3, where='line 20')
 ZERO = replace(FRAME, owners=('wire',), kind='zero', thing='the device', longer=WIRES)
 
 
@@ -74,6 +75,29 @@ ZERO = replace(FRAME, owners=('wire',), kind='zero', thing='the device', longer=
             'weight; add 2 mm to the distances of wire and subtract 1 mm from the distances of '
             'other before that',
             'the zero of wire moved by 1.2 mm before pose 7',
+        ),
+        (
+            replace(FRAME, where=f'line 5{IF_IN_ORDER}', later=LATER, unused=ASIDE),
+            'the device moved by 1.2 mm (base) before line 5, by 1.2 mm before line 9, by -2 mm '
+            'before line 20 (if rows are in the order of measurement); measurements with it '
+            'elsewhere carry no weight',
+            'base moved by 1.2 mm before pose 7 and later again',
+        ),
+        (
+            replace(JOINT, size=-SIZE, later=LATER[1:]),
+            'the zero of elbow_joint moved by -1.2 mrad before row 5, by -2 mm before line 20',
+            f'the zero of elbow_joint moved by -1.2 mrad before pose 7 and later again{AGAIN}',
+        ),
+        (
+            replace(JOINT, size=-SIZE),
+            'the zero of elbow_joint moved by 1.2 mrad before row 5',
+            f'the zero of elbow_joint moved by 1.2 mrad before pose 7{AGAIN}',
+        ),
+        (
+            replace(LOAD, later=LATER[:1]),
+            'the load of the arm changed before row 5, before line 9: poses differ by 1.2 mm; '
+            'measure with one load, or fit only the poses before or only those after',
+            f'the load of the arm changed before pose 7{AGAIN}',
         ),
     ],
 )

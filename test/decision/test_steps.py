@@ -228,7 +228,8 @@ def test_a_step_of_which_samples_are_fitted_is_not_beside_the_fit():
     system = problem.system(problem.sets)
     fit = minimise(result.chain, result.names, system, iterations=0)
     robust = Robust(fit, system, (distances,), True, problem.loss)
-    step = find_step(SimpleNamespace(problem=problem, names=result.names, robust=robust))
+    parts = {'problem': problem, 'names': result.names, 'noise': result.noise}
+    step = find_step(SimpleNamespace(**parts, robust=robust))
     assert step.kind == 'base'
     assert not step.unused
     assert step.harmful
