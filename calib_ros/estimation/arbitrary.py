@@ -21,7 +21,10 @@ A_POSE = Observations.from_arrays(np.zeros((1, 0)), np.zeros((1, 3)), np.eye(3)[
 def drawn(
     chain: Chain, names: Sequence[str], sets: Sequence[Observations]
 ) -> tuple[Chain, list[FloatArray]]:
-    """Return a chain with arbitrary frames, and the rows (R, P) of each set at many poses."""
+    """Return a chain with arbitrary frames, and the rows (R, P) of each set at many poses.
+
+    A socket or plane touched by several sets is in one place.
+    """
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
     frames = [name for name in names if chain.owns_frame(name)]
@@ -29,13 +32,17 @@ def drawn(
     anywhere = chain.with_offsets(dict(zip(frames, places, strict=True)))
     approach = rng.choice(np.array([-1.0, 1.0]), joints.shape)
     velocity = rng.normal(size=joints.shape)
-    rows = []
+    rows, met = [], set[str]()
     for number, each in enumerate(sets):
         posed = joints
         if each.socket or each.plane:
-            posed, place = _meeting(anywhere, np.roll(joints, number, axis=0), each)
+            rolled, again = np.roll(joints, number, axis=0), each.base in met
+            posed, place = _meeting(anywhere, rolled, each, again)
+            if again and not len(posed):  # out of reach of another target
+                posed, place = _meeting(anywhere, rolled, each, False)
             shift = dict(zip(parameters_of(each.base)[:3], -place, strict=True))
             anywhere = anywhere.with_offsets({n: x for n, x in shift.items() if n in names})
+            met |= {name.owner for name in shift if name in names}
         model = ErrorModel(anywhere, names, each.base, each.tool)
         signs, rates = approach[: len(posed)], velocity[: len(posed)] if each.moving else None
         jacobian = model.jacobian(posed, signs, rates, each.seen)
@@ -52,17 +59,18 @@ def drawn(
 
 
 def _meeting(
-    chain: Chain, joints: FloatArray, each: Observations
+    chain: Chain, joints: FloatArray, each: Observations, again: bool
 ) -> tuple[FloatArray, FloatArray]:
     """Return joint values (M, n) that bring the target to one place, and that place (3,) [m].
 
-    The place of the first pose, or the median height of a plane. Poses that do not arrive within
-    20 steps, stretched, are left out.
+    The place of the first pose, or the median height of a plane; `again` the origin. Poses that do
+    not arrive within 20 steps, stretched, are left out.
     """
     places = chain.forward(joints, base=each.base, tool=each.tool)
     place = places[0, :3, 3].copy()
     if each.plane:
         place[:] = 0.0, 0.0, np.median(places[:, 2, 3])
+    place *= not again
     places[:, :3, 3] = place
     part = slice(2, 3) if each.plane else slice(3)
     found = solve(chain, places, joints, each.base, each.tool, part, 20)

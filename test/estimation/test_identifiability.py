@@ -306,3 +306,19 @@ def test_sockets_and_planes_alone_leave_the_size_to_the_longest_length(rng):
             assert len(found) == 23
     without = [name for name in names if name != 'shoulder_lift_joint.a']
     assert identifiable_and_held(arm, without, [socket])[1] == ()
+
+
+@pytest.mark.parametrize('plane', [False, True])
+def test_a_place_touched_in_two_sets_tells_no_more_than_in_one(plane, rng):
+    """Neither the size of the arm, with one ball or two."""
+    q, places = UR10E.random_joints(3, rng), np.zeros((3, 3))
+    seen = Observations.from_arrays(q, places)
+    kind = {'plane': True, 'distances': np.zeros(3)} if plane else {'socket': True}
+    one = replace(seen, base='base_a', **kind)
+    other = replace(one, tool='tool_b')
+    sets = (one,), (one, one), (one, other), (other, one, other)
+    problems = [Problem(UR10E, first, more=more) for first, *more in sets]
+    found = [identifiable_and_held(p.model, p.free, p.sets) for p in problems]
+    assert len({held for _, held in found}) == 1
+    counts = [len(names) for names, _ in found]
+    assert counts == [counts[0]] * 2 + [counts[0] + 3] * 2
