@@ -364,19 +364,19 @@ def _of_signs(chain: Chain) -> Iterator[Suspect]:
 
 def _of_arms(chain: Chain) -> Iterator[Suspect]:
     """Yield lengths in mm, the other convention, wrong signs, and arms with like joints."""
-    if too_long(chain):  # a shorter one is of metres: any place fits a tiny arm to its size
-        small = [replace(j, a=1e-3 * j.a, b=1e-3 * j.b, d=1e-3 * j.d) for j in chain.joints]
+    if length := too_long(chain, 10.0):  # no arm is under a centimetre
+        small = tuple(replace(j, a=1e-3 * j.a, b=1e-3 * j.b, d=1e-3 * j.d) for j in chain.joints)
         what, remedy = 'the lengths of the chain file are in mm, not metres', 'give metres there'
-        yield Suspect(what, remedy, chain=replace(chain, joints=tuple(small)), published=remedy)
+        large = f' (--length m if the arm is {length:.0f} m long)' * (length <= 100.0)
+        yield Suspect(what, remedy + large, chain=replace(chain, joints=small), published=remedy)
     other: Convention = 'modified' if chain.convention == 'standard' else 'standard'
     what = f'the DH table is in the {other} convention, not the {chain.convention} one'
     remedy = f'convention: {other} in the chain file'
     arm = replace(chain, convention=other, parallel=None)
     yield Suspect(what, remedy, rank=3, chain=arm, published=remedy)
     yield from _of_signs(chain)
-    types = [joint.type for joint in chain.joints]
     for ours in shipped_chains():
-        if [joint.type for joint in ours.joints] != types:
+        if [joint.type for joint in ours.joints] != [joint.type for joint in chain.joints]:
             continue
         if ours.columns != chain.columns or not np.allclose(ours.table, chain.table, atol=1e-6):
             what, remedy = f'the arm is a {ours.name}, not a {chain.name}', f'--chain {ours.name}'

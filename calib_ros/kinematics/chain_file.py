@@ -88,11 +88,14 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
     return chain
 
 
-def too_long(chain: Chain) -> float:
-    """Return the length [m] of the links together if it is in mm: no arm is as long; else 0."""
+def too_long(chain: Chain, most: float = 100.0) -> float:
+    """Return the length [m] of the links together if it is over `most`, else 0.
+
+    Over 100 m it is in mm: no arm is as long, or smaller than 0.1 m.
+    """
     along = sum(each.d for each in chain.joints)  # parallel axes share any d, with signs
     length = sum(abs(each.a) for each in chain.joints) + abs(along)
-    return length if length > 100.0 else 0.0  # 0.1 m in mm: no arm is smaller
+    return length if length > most else 0.0
 
 
 def _refuse_other_units(chain: Chain, where: str) -> None:

@@ -270,13 +270,17 @@ def test_another_robot_and_the_other_convention_are_named():
     assert 'convention: standard' in str(diagnose(Problem(other, seen)))
 
 
-@pytest.mark.parametrize('b', [0.0, 0.3])
-def test_a_chain_file_in_millimetres_is_named(b):
+@pytest.mark.parametrize(('b', 'size'), [(0.0, 1.0), (0.3, 1.0), (0.0, 0.03)])
+def test_a_chain_file_in_millimetres_is_named(b, size):
+    """Of an arm of 40 mm the positions were told to be in metres, not mm."""
     first, *others = UR.joints
-    arm = replace(UR, joints=(replace(first, b=b), *others))
-    rows = tuple(replace(j, a=1e3 * j.a, b=1e3 * j.b, d=1e3 * j.d) for j in arm.joints)
-    named = identify(Problem(replace(arm, joints=rows), seen_of(arm))).refusals[0]
-    assert 'the lengths of the chain file are in mm, not metres' in named
+    rows, arms = (replace(first, b=b), *others), []
+    for k in (size, 1e3 * size):
+        joints = [replace(j, a=k * j.a, b=k * j.b, d=k * j.d) for j in rows]
+        arms.append(replace(UR, joints=tuple(joints)))
+    named = identify(Problem(arms[1], seen_of(arms[0]))).refusals[0]
+    assert named.startswith('the lengths of the chain file are in mm, not metres: give metres')
+    assert ('--length m if the arm is' in named) == (size < 1.0)
 
 
 @pytest.mark.parametrize(('stated', 'remarks'), [(0.1, 0), (0.01, 1)])
