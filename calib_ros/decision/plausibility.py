@@ -170,23 +170,28 @@ def _level_hand(problem: Problem, result: Identification) -> str:
 
     A target LEVER off is further off than the remaining error by the tilts of the hand.
     """
-    places = [p.name for p in result.parameters if p.status == 'gauge' and p.name.is_length]
-    known = problem.chain.all_frames
-    hidden = [n for n in places if n.owner.startswith('tool') and known.get(n.owner) is None]
+    known, hidden = problem.chain.all_frames, set[Parameter]()
+    for name, others in result.gauges.items():
+        every = [Parameter(each) for each in (name, *others)]
+        tools = {n for n in every if n.owner.startswith('tool') and n.is_length}
+        if every[0].is_length and problem.model.owns_frame(name):
+            hidden |= tools if all(known.get(n.owner) is None for n in tools) else set()
     if not hidden:
         return ''
     ends = [*parameters_of('base'), *parameters_of('tool')]
     along = [name for name in ends if name in {f'tool.{n.kind}' for n in hidden}]
-    frames, joints = [n for n in ends if n not in along], problem.sets[0].spread().joints
+    frames = [n for n in ends if n not in along]
+    joints = np.concatenate([each.spread().joints for each in problem.sets])
     *_, tilted = best_imitation(result.chain, frames, along, joints, 0.0)
     off = LEVER * np.linalg.norm(tilted) / np.sqrt(len(joints))
     left = 1e-3 * (result.validation or result.fitted).figures[1].rms_mm
     if off < max(left, SIMULATED):
         return ''
+    there = [f'{n}, taken as {round(result.chain.value(n), 3) + 0.0:g}' for n in sorted(hidden)]
     return (
-        f'a hand that stays level hides {", ".join(hidden)}, taken as 0, but tilts by errors of '
-        f'the arm: tool points {LEVER:g} m from there are {1e3 * off:.2g} mm off. Give tool in '
-        'the chain file, to a centimetre'
+        f'a hand that stays level hides {", and ".join(there)}, but tilts by errors of the arm: '
+        f'tool points {LEVER:g} m from there are {1e3 * off:.2g} mm off. Give '
+        f'{min(hidden).owner} in the chain file, to a centimetre'
     )
 
 

@@ -153,6 +153,30 @@ def test_so_is_that_on_a_scara_whose_axes_tilt(rng):
         assert bool(found) is told
 
 
+@pytest.mark.parametrize(
+    ('kind', 'told'),
+    [
+        ('base', 'tool.z, taken as 0, but tilts'),
+        ('tool', 'tool_a.z, taken as 0, and tool_b.z, taken as 0.05, but tilts'),
+    ],
+)
+def test_so_it_is_with_two_devices_or_targets(kind, told, rng):
+    """The height of one device over another, or of one target, was the gauge; no tool was 0."""
+    scara = replace(load_chain('denso_hsr065'), base=None, tool=None)
+    true, q = faulty(scara, Cell(), rng), scara.random_joints(60, rng)
+    sets = []
+    for k, name in enumerate('ab'):
+        there = true.with_offsets({f'{kind}.z': 0.05 * k})
+        seen = measure(there, q[30 * k : 30 * k + 30], rng, *NOISE)
+        sets.append(replace(seen, **{kind: f'{kind}_{name}'}))
+    problem = Problem(scara, sets[0], more=sets[1:], **SIGMAS)
+    (found,) = (each for each in identify(problem).remarks if 'stays level' in each)
+    assert told in found
+    known = replace(scara, frames=((f'{kind}_a', None), ('tool_a', true.tool)), tool=true.tool)
+    given = identify(replace(problem, chain=known))
+    assert not any('stays level' in each for each in given.remarks)
+
+
 @pytest.mark.parametrize('second', ['motor" multiplier="-1" offset="0.2', 'outer" multiplier="-2'])
 def test_the_first_joint_of_a_column_leads_the_others_of_a_motor_elsewhere(second, rng):
     """Two lifts mimic one that is not between the links, or one of them the other."""
