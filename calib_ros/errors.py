@@ -84,11 +84,11 @@ class TooFewObservationsError(InputError):
 
     def __init__(self, configurations: int, needed: int, why: str, account: str = '') -> None:
         self.configurations, self.needed, self.why = configurations, needed, why
-        super().__init__(
-            f'too few different poses: {configurations} measured, at least {needed} needed ({why})'
-            f'{account and f" ({account})"}; measure {max(30, 2 * needed)} or more, or hold '
-            'parameters (fixed)'
+        self.brief = (
+            f'too few different poses: {configurations} measured, at least {needed} needed'
         )
+        self.advice = f'measure {max(30, 2 * needed)} or more, or hold parameters (fixed)'
+        super().__init__(f'{self.brief} ({why}){account and f" ({account})"}; {self.advice}')
 
     def after(self, account: str) -> TooFewObservationsError:
         """Return the error with what was received."""

@@ -45,7 +45,8 @@ def parse_number(
     try:  # YAML 1.1 reads 1e-3, without a dot, as a string
         number = float(value) if isinstance(value, int | float | str) else math.nan
     except (ValueError, OverflowError):
-        number, how = math.nan, ': write it out, such as 1.5708' * isinstance(value, str)
+        number = math.nan
+        how = ': write it out, such as 1.5708' if value and isinstance(value, str) else ''
     if isinstance(value, bool) or not math.isfinite(number):
         raise error(f'{where} must be a finite number, not {value!r:.100}{how}')
     if abs(number) > largest:

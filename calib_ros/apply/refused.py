@@ -67,8 +67,8 @@ def unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
             i = int(outer[k].argmax())
             reason = (
                 f'the command {command[k, i]:.6g} of {names[i]} is beyond its limits '
-                f'{follower.lower[i]:.6g} to {follower.upper[i]:.6g} (rad or m; in degrees only '
-                'if the column is so named: q1 [deg])'
+                f'{follower.lower[i]:.6g} to {follower.upper[i]:.6g} (rad or m, not degrees; a '
+                'table has degrees in q1 [deg])'
                 + a_turn_away(compensator.nominal.joints[i], float(command[k, i]))
             )
         elif result.limited[k].any():

@@ -108,6 +108,8 @@ class Step:
     def told(self, number: int) -> str:
         """Return what moved in short, for an operator of the node who counts poses so."""
         again = ', measure again after ~/clear'
+        if self.slow:
+            return f'{self.what} seems to move slowly, {self._size} in all: mix the order of poses'
         if self.kind in OF_THE_ARM:
             return f'{OF_THE_ARM[self.kind]} changed before pose {number}{again}'
         what = f'the zero of {self.what}' if self.kind in ZEROS else self.what

@@ -20,6 +20,7 @@ from calib_ros.estimation.levels import CLEARLY, SURE, chance_of
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.system import row_samples, stacked
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import TWO_TURNS
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.values import ROUNDED, SAME
@@ -32,8 +33,13 @@ STEPS = (
 
 
 def rounded_joints(problem: Problem) -> dict[str, float]:
-    """Return the joints whose values are multiples of a step [rad or m], with the step."""
+    """Return the joints whose values are multiples of a step [rad or m], with the step.
+
+    None if some are hardly rad or m: the steps are of another unit.
+    """
     joints = np.concatenate([each.joints for each in problem.sets])
+    if np.abs(joints).max() > TWO_TURNS:
+        return {}
     steps = {name: step_of(q) for name, q in zip(problem.chain.joint_names, joints.T, strict=True)}
     return {name: step for name, step in steps.items() if step > 0.0}
 

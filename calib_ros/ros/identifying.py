@@ -21,7 +21,14 @@ from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.moved import IN_THE_CELL, Step
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
-from calib_ros.errors import LONGEST, ConfigError, InputError, shortened, trouble
+from calib_ros.errors import (
+    LONGEST,
+    ConfigError,
+    InputError,
+    TooFewObservationsError,
+    shortened,
+    trouble,
+)
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
@@ -149,8 +156,8 @@ class Identifying:
                 self._failed(err, '')
                 raise
             why = inputs.failures
-            told = InputError('; '.join((*why, str(err))))
             hint = next((each.status for each in session.last_hints), session.state)
+            told = InputError('; '.join((*why, str(err), *(() if why else (hint,)))))
             self._failed(told, '; '.join(('no poses to fit', *why)), '' if why else hint)
             raise told from err
         samples = tuple(session.usable)
@@ -188,6 +195,8 @@ class Identifying:
 
     def _failed(self, err: Exception, said: str, advice: str = '') -> None:
         self.earlier, self.last = ONE_BEFORE, f'no result: {trouble(err)}'
+        if isinstance(err, TooFewObservationsError):
+            said, advice = err.brief, advice or err.advice
         self._short = said, advice, ''
 
     def _judged(self, given: Snapshot, result: Identification) -> Answer:
@@ -201,7 +210,8 @@ class Identifying:
         hint = next(iter((*loaded.warnings, *words.other_remarks(result))), '')
         moved, nearer = _moved(result, given), _nearer(result, given.since)
         self.last = words.summary(result, numbers, loaded.warnings, first)
-        self.last += f'; {moved}' * bool(moved)
+        if moved and result.step and not result.step.slow:  # else told already
+            self.last += f'; {moved}'
         said, advice = words.verdict(result), moved or nearer or brief or hint
         if telling or (moved and not result.accepted):
             said, advice = f'{words.REFUSED}: {telling or moved}', ''
@@ -271,7 +281,7 @@ class Identifying:
 def _moved(result: Identification, given: Snapshot) -> str:
     """Tell what moved, if the result is accepted, or refused for that."""
     step, refusals = result.step, result.refusals
-    if step is None or step.slow or (refusals and given.cause and step.kind in IN_THE_CELL):
+    if step is None or (refusals and given.cause and step.kind in IN_THE_CELL):
         return ''
     if refusals and refusals[0].rule not in (Rule.MOVED, Rule.ENCODER):
         return ''

@@ -95,7 +95,9 @@ class Keeper:
     def to_save(self) -> tuple[Published, Path | None]:
         """Return the calibration to save, and `target_filename` as it is now."""
         if not self._published.text:
-            raise InputError('there is no accepted calibration to save: call ~/identify first')
+            raise InputError(
+                'there is no accepted calibration to save: ~/identify must accept one first'
+            )
         return self._published, self._named('target_filename')
 
     def save(self, found: tuple[Published, Path | None]) -> tuple[bool, str]:

@@ -200,13 +200,12 @@ class Collector:
             return f'the arm is moving{"" if known else ask}'
         if stands[-1, 0] <= max(self._sampled_ns, self._seated_ns):
             return 'the arm stands and its pose is measured: move on'
-        if (
-            self.settings.mode == 'dwell'
-            and stands[-1, 0] < self._settled_ns
-            and not self._measured(self._settled_ns, newest)
-        ):
+        seated = self._seated_ns > 0 and not self.waiting.count  # in sockets only, so far
+        asked = seated or self.settings.mode == 'triggered'
+        settled = stands[-1, 0] < self._settled_ns
+        if settled and not asked and not self._measured(self._settled_ns, newest):
             return 'the arm stands, and nothing has been measured yet'
-        ask = ': call ~/capture' * (self.settings.mode == 'triggered')
+        ask = ': call ~/capture' * asked
         return f'the arm stands for {1e-9 * (newest - self._begin(stands)):.1f} s{ask}'
 
     def capture(self, place: str = '') -> tuple[int, str]:

@@ -139,6 +139,8 @@ def test_what_rounding_gives_to_the_zero_of_a_joint(step, rng):
     q[:, 1], q[:, 2] = step * rng.permutation(600)[:40], step * np.repeat([0, 1, 3], [20, 10, 10])
     q[:, 3] = step * np.repeat([0, 1], 20)  # two values tell no step
     problem = Problem(UR10E, measure(UR10E, q, rng))
+    q[7, 4] = 45.0  # as in degrees
+    assert rounded_joints(Problem(UR10E, measure(UR10E, q, rng))) == {}
     steps = rounded_joints(problem)
     assert steps == {'shoulder_lift_joint': step, 'elbow_joint': step}
     one = step / np.sqrt(12.0)

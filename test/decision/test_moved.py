@@ -44,7 +44,7 @@ ZERO = replace(FRAME, owners=('wire',), kind='zero', thing='the device', longer=
             'the device seems to have moved slowly, by 1.2 mm over the session (base); if the '
             'poses follow an order, errors of the arm may look so: mix them; measurements from '
             'there on carry no weight',
-            'base moved by 1.2 mm before pose 7',
+            'base seems to move slowly, by 1.2 mm in all: mix the order of poses',
         ),
         (
             replace(FRAME, apart=True),

@@ -120,6 +120,8 @@ def test_what_made_poses_too_few_is_in_the_answer_though_the_error_is_cut(cell, 
     first, advice, _ = identifying.shortened((False, text))[1].split(' ... ')
     assert first.startswith('too few different poses: 2 measured')
     assert advice == hint.status
+    identifying._failed(TooFewObservationsError(2, 5, '6 equations each', counts), text)
+    assert 'at least 5 needed ... measure 30' in identifying.shortened((False, text))[1]
 
 
 @pytest.mark.parametrize('short', [('', '', ''), ('poses came in different frames' * 9, '', '')])

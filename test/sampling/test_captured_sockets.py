@@ -16,9 +16,9 @@ from calib_ros.settings import Settings
 S = 1_000_000_000
 
 
-def captured(problem, count=4):
+def captured(problem, count=4, mode='triggered'):
     """Return a session in which the ball was captured in each socket a few times."""
-    session = CalibrationSession(IIWA, Settings(mode='triggered', sigma_position=1e-5))
+    session = CalibrationSession(IIWA, Settings(mode=mode, sigma_position=1e-5))
     now = 10 * S
     for number, each in enumerate(problem.sets):
         for row in each.joints[:count]:
@@ -37,9 +37,13 @@ def captured(problem, count=4):
     return session
 
 
-def test_who_has_captured_a_pose_is_no_longer_told_how_to_stop():
-    session = captured(cell(0)[1], count=1)
-    take(session, of_joints(joint_state(18 * S, IIWA.joint_names, [0.5] * 7)))
+@pytest.mark.parametrize('mode', ['triggered', 'dwell'])
+def test_who_has_captured_a_pose_is_told_to_capture_again_but_no_longer_how_to_stop(mode):
+    session = captured(cell(0)[1], 1, mode)
+    for time in range(19 * S, 30 * S, S // 20):
+        take(session, of_joints(joint_state(time, IIWA.joint_names, [0.3] * 7)))
+    assert ' s: call ~/capture; ' in session.status()
+    take(session, of_joints(joint_state(30 * S, IIWA.joint_names, [0.5] * 7)))
     assert session.status().startswith('the arm is moving; ')
 
 
