@@ -36,7 +36,7 @@ DEEPEST = MOST_ENTRIES // 50  # levels of nested YAML
 NESTED = (Mapping, list, tuple)
 MOST_NODES = LARGEST_TEXT // 20
 """Values in a YAML document with expanded aliases; 20 characters count as one."""
-MARKUP = re.compile(r'[\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_])|^[>#+-]')
+MARKUP = re.compile(r'[\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_])|^(?:[>#]|[+-](?!\d))')
 """Markdown markup; underscores only where they may start emphasis."""
 TABS = re.compile(r'^ *\t', re.MULTILINE)
 FORMULA = re.compile(r"'*[=+\-@\t\r]")

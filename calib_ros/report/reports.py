@@ -341,8 +341,9 @@ def _parameters(result: Identification) -> Section:
         unit = p.name.unit.removeprefix('1')  # a pure number has none
         placed = p.std is None or result.chain.owns_frame(p.name)
         found = (None if placed else p.offset, p.std, p.half_width())
-        forms = zip(found, ('+.4f', '.4f', '.4f'), strict=True)
-        numbers = ['' if x is None else f'{scale * x:{form}}' for x, form in forms]
+        digits = max(4, len(rounded(scale * (p.std or 0.0)).partition('.')[2]))
+        forms = zip(found, ('+', '', ''), strict=True)
+        numbers = ['' if x is None else f'{scale * x:{sign}.{digits}f}' for x, sign in forms]
         rows.append((p.name, f'{p.value:.9f} {unit}'.rstrip(), *numbers, small, p.status))
     more = f'; the {unlisted} harmonics of gears are in result.json' if unlisted else ''
     return section(

@@ -245,9 +245,9 @@ def sigma_over_range(result: Identification) -> dict[str, float]:
 
 def times_in_words(noise: Noise) -> str:
     """Return the ratio of the residuals to the device's noise."""
-    turned = noise.orientation
-    text = '' if turned is None else f', {turned:,.2f} times in orientation'
-    return f'{noise.position:,.2f} times the stated device noise{text}'
+    shown = [f'{x:,.{2 if x < 100.0 else 0}f}' for x in (noise.position, noise.orientation or 0.0)]
+    text = '' if noise.orientation is None else f', {shown[1]} times in orientation'
+    return f'{shown[0]} times the stated device noise{text}'
 
 
 def scatter_in_words(noise: Noise) -> str:
