@@ -92,8 +92,9 @@ class Columns:
         if words and row == 0:  # perhaps, as other tables have below their header
             told = '' if bare.strip('[]()').lower() in UNIT_SIGNS else f'{remedy}; '
             remedy = f'{told}units belong into the header: q1 [deg]'
+        found = repr(text) if text else 'empty or NaN'
         return (ColumnsError if words or (commas and not row) else InputError)(
-            f'{self.where(row, called)} must be a finite number, not {text!r}: {remedy}'
+            f'{self.where(row, called)} must be a finite number, not {found}: {remedy}'
         )
 
     def numbers(self, names: Sequence[str], called: Sequence[str] = ()) -> FloatArray:

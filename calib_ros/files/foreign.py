@@ -209,6 +209,7 @@ class _Table:
         kept, guessed = dict[str, Expression](), dict[str, str]()
         asked = {name for each in self._columns.values() for name in each.names}
         lower = [name.lower() for name in self._sheet.header]
+        theirs = {*map(str.lower, self._chain.joint_names)} if self._chain else set[str]()
         for name, ours in own.items():
             found = places(self._sheet.header, name) or places(lower, name.lower())
             if ours in kept or ours in self._columns or not found:
@@ -220,7 +221,7 @@ class _Table:
             rate = JOINT.fullmatch(ours) and ours[0] in 'sva'
             other = rate or ours in (*WORDS, *SIGMAS, 'time', 'delay')
             number = f'#{column + 1}'
-            if (rate and (bare != name or number in asked)) or (
+            if (rate and (bare != name or number in asked or name in theirs)) or (
                 other and unit not in (*UNIT_SIGNS, *SECONDS)
             ):
                 continue  # the axes of KUKA are A1, a1, ...: no accelerations

@@ -344,7 +344,7 @@ WRONG = [
     ('.csv', 'q1 [deg],q2,q3,q4,q5,q6\n1,2,3,4,5,6\n', r'q1 .deg. has: name it in all'),
     ('.csv', 'q1,q2,q3,q4,q5,q6,q6 [deg]\n1,2,3,4,5,6,6\n', 'columns q6, q6 .deg.: keep one'),
     ('.csv', '# picks\nq1,q2,q3,q4,q5,q6\n1,2,3,4,5,6\n', 'header; remove other lines above'),
-    ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5\n', "line 2: q6 must be a finite number, not ''"),
+    ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5\n', 'line 2: q6 must be a finite number, not empty'),
     ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5,x\n', "line 2: q6 must be a finite number, not 'x'"),
     ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5,nan\n', 'q6 must be a finite number'),
     ('.yaml', '[', 'is not valid YAML'),

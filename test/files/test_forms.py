@@ -339,6 +339,16 @@ def test_joints_called_as_the_positions_are_are_told_apart(tmp_path, header, sai
         read_table(path, 3, foreign=Foreign(Layout(), GANTRY))
 
 
+def test_axes_in_small_letters_are_no_accelerations(tmp_path):
+    """They were joint values and accelerations."""
+    path = tmp_path / 'cell.csv'
+    path.write_text('a1 [deg],a2 [deg],x,y,z\n1,2,3,4,5\n2,3,4,5,6\n')
+    arm = Chain('arm', 'standard', (Joint('A1'), Joint('A2')))
+    (found,) = read_table(path, 2, foreign=Foreign(Layout(), arm)).fitted
+    np.testing.assert_allclose(found.joints, np.radians([[1, 2], [2, 3]]))
+    assert found.acceleration is None
+
+
 @pytest.mark.parametrize('named', [{}, {'x': 'X', 'y': 'Y', 'z': 'Z'}])
 def test_a_column_is_not_a_joint_value_and_a_position(tmp_path, named):
     path = tmp_path / 'cell.csv'

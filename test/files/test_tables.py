@@ -166,7 +166,8 @@ FAULTS = [
     ),
     (f'q1,q2,x,y,z,frame_id\n{NAMED}', r'map \(lines 3, 4, 5, 6, 7, and 3 more\)'),
     *((POINTS.replace('5.5', f'"{each}"'), f"y must be a finite number, not '{each}': correct")
-      for each in ('nan', 'inf', '-inf', '', ' ', 'twelve', '1;2')),
+      for each in ('nan', 'inf', '-inf', ' ', 'twelve', '1;2')),
+    (POINTS.replace('5.5', '""'), 'y must be a finite number, not empty or NaN: correct'),
     (POINTS.replace('5.5', '5.5 mm'), r'y must be .*: write its unit into the header, y \[mm\]'),
     (POINTS.replace('5.5', '"0,5"'), "line 3: y must be .*, not '0,5': write a point"),
     ('q1,q2,x,y,z,distance\n0,0,,,,3\n0,0,1,2,3,4\n', 'line 3 has both x and distance: '),

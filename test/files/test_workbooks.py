@@ -64,7 +64,7 @@ def test_formulas_with_values_are_read(read, replaced):
 
 def test_formulas_of_empty_text_are_empty(read):
     made = (f'r="D3">{FORMULA}', 'r="D3" t="str"><f>1/4</f><v></v>')
-    with pytest.raises(InputError, match=r"line 3: y must be a finite number, not ''"):
+    with pytest.raises(InputError, match=r'line 3: y must be a finite number, not empty'):
         read('=1/4', made, LATER)
 
 
