@@ -171,11 +171,13 @@ def _level_hand(problem: Problem, result: Identification) -> str:
     A target LEVER off is further off than the remaining error by the tilts of the hand.
     """
     known, hidden = problem.chain.all_frames, set[Parameter]()
-    for name, others in result.gauges.items():
-        every = [Parameter(each) for each in (name, *others)]
+    places = (p.name for p in result.parameters if p.status == 'gauge' and p.name.is_length)
+    for name in filter(problem.model.owns_frame, places):
+        every = map(Parameter, (name, *result.gauges[name]))
         tools = {n for n in every if n.owner.startswith('tool') and n.is_length}
-        if every[0].is_length and problem.model.owns_frame(name):
-            hidden |= tools if all(known.get(n.owner) is None for n in tools) else set()
+        if name in tools:
+            tools = {n for n in tools if n.kind == name.kind}
+        hidden |= tools if all(known.get(n.owner) is None for n in tools) else set()
     if not hidden:
         return ''
     ends = [*parameters_of('base'), *parameters_of('tool')]
