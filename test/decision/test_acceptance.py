@@ -60,6 +60,9 @@ def test_orientations_may_get_worse_by_half_a_per_cent_and_positions_be_off_by_t
         assert rules == [Rule.LARGEST_ERROR] * refused
     (scale,) = refusals(problem, result, None, False, True, -0.02)
     assert 'shrink alike, by 2 %' in scale
+    far = replace(result, surprise=3.0, region=None)
+    (nowhere,) = refusals(problem, far, None, False, True, -0.02)  # that comes before the scale
+    assert 'even at the poses measured: held-out poses are 3 times further off' in nowhere
     (drift,) = refusals(problem, replace(result, chance=0.07), None, False, True)
     assert drift.endswith('just as well in 7 % of cases (limit 5 %)')
     gross = replace(held_out, judged=np.arange(len(held_out.judged)) >= 24)

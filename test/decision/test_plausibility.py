@@ -10,9 +10,10 @@ from fits import NOISE, SCARA, SIGMAS, arm, rms
 
 from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision.misfits import explained_share
+from calib_ros.decision.misfits import coupling_share, explained_share
 from calib_ros.decision.plausibility import _motion
 from calib_ros.decision.reasons import Rule
+from calib_ros.estimation.gross_errors import SUSPICIOUS
 from calib_ros.estimation.system import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Joint
@@ -101,7 +102,12 @@ def test_the_share_explained_is_that_of_least_squares():
     fewer, more = (np.linalg.lstsq(rows[:, :k], rows[:, -1])[1][0] for k in (len(names), -1))
     found = explained_share(problem, chain, names, added)
     assert found == pytest.approx(1.0 - more / fewer, rel=1e-6)
-    assert 0.1 < found < 0.9
+    assert 0.5 < found < 0.9
+    bare = replace(chain, effects=())
+    for model, noise, wanted in ((bare, 1.0, found), (bare, 0.99, 0.0), (chain, 1.0, 0.0)):
+        fitted = SimpleNamespace(problem=problem, chain=model, names=names)
+        fitted.noise = SimpleNamespace(position=noise * SUSPICIOUS)
+        assert coupling_share(fitted) == wanted  # of large errors, if they are not fitted
     for count, some in ((3, False), (4, True)):  # of 18 rows 3 would be left, of 24 rows 9
         few = replace(problem, observations=problem.observations.select(np.arange(count)))
         assert (explained_share(few, chain, names, added) > 0.0) == some

@@ -356,6 +356,8 @@ def test_a_device_out_of_scale_does_not_spoil_an_arm_of_small_errors(seed):
 def test_a_damaged_region_is_refused(local, change):
     used = local.region.document() | {'share': 0.0}
     assert region_of_record({'region': used}, local.chain, 'here').share == 0.0
+    older = {key: value for key, value in used.items() if key != 'device'}
+    assert not region_of_record({'region': older}, local.chain, 'here').device.size
     with pytest.raises((ConfigError, UnknownNameError), match=r'here: calibration\.region'):
         region_of_record({'region': used | change}, local.chain, 'here')
 

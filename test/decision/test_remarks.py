@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fits import NOISE, SIGMAS, UR10E as UR, measured_arm
+from scipy import stats
 
 from calib_ros.apply.simulation import measure
-from calib_ros.decision import plausibility
+from calib_ros.decision import plausibility, validation
 from calib_ros.decision.misfits import loose_target
 from calib_ros.decision.reasons import Reason, Rule
-from calib_ros.decision.validation import held_out_excess
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import TELLING
 from calib_ros.estimation.observations import Observations
@@ -321,21 +321,26 @@ def test_held_out_poses_that_contradict_widen_all_errors_stated(slip, finer, rul
     assert (expected > noise) == told
 
 
-@pytest.mark.parametrize('found', [0.0, 1.0])
-def test_without_noise_and_expected_errors_nothing_is_widened(found):
+def test_errors_are_widened_by_what_chance_does_not_explain(monkeypatch):
     """Computed poses divided by zero."""
-    nothing = SimpleNamespace(
-        distances=None,
-        pixels=None,
-        joints=np.zeros((2, 1)),
-        base='base',
-        tool='tool',
-        approach=None,
-        covariances=lambda sigmas: np.zeros((2, 6, 6)),
-    )
-    problem = SimpleNamespace(judging=[nothing], sigma_position=1e-4, sigma_orientation=1e-4)
-    fitted = SimpleNamespace(problem=problem, noise=SimpleNamespace(position=0.0))
-    figures = [None, SimpleNamespace(rms_mm=found)]
-    judged = SimpleNamespace(repeated=1, figures=figures, deciding=np.ones(2, bool))
-    posterior = SimpleNamespace(expected=lambda *_: np.zeros((2, 6, 6)))
-    assert held_out_excess(fitted, posterior, judged) == (0.0, 1.0)
+
+    def told(found, noise=3.0, expected=4.0, count=2, alike=0.25):
+        monkeypatch.setattr(validation, '_alike', lambda *_: alike)
+        square = 1e-6 / 3.0 * np.tile(np.eye(6), (count, 1, 1))
+        names = ('distances', 'pixels', 'joints', 'base', 'tool', 'approach')
+        seen = SimpleNamespace(**dict.fromkeys(names))
+        seen.covariances = lambda sigmas: (0.5e4 * noise * sigmas[0]) ** 2 * square
+        problem = SimpleNamespace(judging=[seen], sigma_position=1e-4, sigma_orientation=0.0)
+        fitted = SimpleNamespace(problem=problem, noise=SimpleNamespace(position=2.0))
+        judged = SimpleNamespace(repeated=1, figures=[None, SimpleNamespace(rms_mm=found)])
+        judged.deciding = np.ones(count, dtype=bool)
+        posterior = SimpleNamespace(expected=lambda *_: expected**2 * square)
+        return validation.held_out_excess(fitted, posterior, judged)
+
+    assert told(0.0, 0.0, 0.0) == told(1.0, 0.0, 0.0) == (0.0, 1.0)
+    freedom = 1.0 / ((1.0 - 0.64**2) / 6.0 + 0.64**2 * 0.25)  # of the arm's errors four
+    limit = 5.0 * np.sqrt(stats.chi2.isf(0.001, freedom) / freedom)
+    assert told(0.99 * limit) == told(7.4, count=2000, alike=1e-4) == (0.0, 1.0)
+    for found, more in ((1.01 * limit, {}), (7.6, {'count': 2000, 'alike': 1e-4})):
+        wider = found / 5.0, np.sqrt(found**2 - 9.0) / 4.0
+        assert told(found, **more) == pytest.approx(wider)

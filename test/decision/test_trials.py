@@ -3,6 +3,7 @@
 """An arm tried on some samples, a part of which may be gross errors."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,15 @@ from fits import NOISE, UR10E, measured_arm
 from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.reasons import Rule
-from calib_ros.decision.trials import Trial, fits_each_side, refine_trial, sample_errors, trial_of
+from calib_ros.decision.trials import (
+    Trial,
+    _usual,
+    fits_each_side,
+    refine_trial,
+    sample_errors,
+    set_in_words,
+    trial_of,
+)
 from calib_ros.estimation.start import flange
 
 
@@ -85,4 +94,16 @@ def test_two_sessions_in_one_are_no_mistakes():
     assert fits_each_side(problem, seen, begin)
     wrong = np.where(seen.stamps_ns < begin, 100.0, 1.0)[:, np.newaxis] * seen.positions
     assert not fits_each_side(problem, replace(seen, positions=wrong), begin)
-    assert not fits_each_side(problem, seen, seen.stamps_ns[7])
+    one, stamps = seen.select(np.arange(24)), seen.stamps_ns
+    assert [fits_each_side(problem, one, stamps[k]) for k in (11, 12, 13)] == [False, True, False]
+
+
+def test_a_usual_share_is_65_percent_and_sets_are_told_by_what_not_all_share(rng):
+    assert _usual(rng.permutation(np.arange(20.0))) == 12.0
+    ends = (('base', 'tool'), ('base', 'tool_b'), ('base_2', 'tool_b'))
+    sets = [SimpleNamespace(base=base, tool=tool) for base, tool in ends]
+    told = [set_in_words(sets, each) for each in sets]
+    words = ('base, tool', 'base, tool_b', 'base_2, tool_b')
+    assert told == [f'in the measurements with {each} alone, ' for each in words]
+    assert set_in_words(sets[:2], sets[1]) == 'in the measurements with tool_b alone, '
+    assert set_in_words(sets[:1], sets[0]) == ''

@@ -87,17 +87,27 @@ def refused(before, after, judged, largest_error=0.01, **change):
     parts = [Residuals(x, none, numbers, none[:, :2]) for x in (before, after)]
     problem = SimpleNamespace(largest_length=1.0, largest_angle=1.0, sets=())
     problem.largest_error = largest_error
-    given = {'converged': True, 'parameters': ()} | change
-    result = SimpleNamespace(
-        step=None,
-        not_excited=(),
-        chance=None,
-        region=1,
-        surprise=0.0,
-        validation=Comparison(*parts, judged),
-        **given,
-    )
+    given = {'converged': True, 'parameters': (), 'chance': None, 'region': 1, 'surprise': 0.0}
+    judging = Comparison(*parts, judged)
+    result = SimpleNamespace(step=None, not_excited=(), validation=judging, **given | change)
     return [*refusals(problem, result, None, False, True)]
+
+
+@pytest.mark.parametrize(('before', 'rules'), [(2.9e-3, [Rule.REGION]), (3.1e-3, [])])
+def test_a_correction_that_new_poses_contradict_is_half_as_good_again_or_refused(before, rules):
+    away, change = np.full((40, 3), 2e-3), {'surprise': 3.0, 'contradiction': 'far off'}
+    found = refused(0.5e3 * before * away, away, np.ones(40, dtype=bool), 1.0, **change)
+    assert [each.rule for each in found] == rules
+    assert all(each.startswith('far off, and the correction lowers') for each in found)
+
+
+def test_a_gain_by_chance_is_told_with_what_chance_can_do(rng):
+    before, after = 1e-3 * rng.normal(size=(2, 20, 3))
+    gain, limit = log_gain(before, after, np.arange(20))
+    assert 0.0 < gain < limit
+    (told,) = refused(before, after, np.ones(20, dtype=bool))
+    least = 1e3 * np.sqrt((before**2).sum(axis=1).mean()) * np.exp(-limit)
+    assert told.endswith(f'; with 20 locations, chance alone can lower it to {least:.3f} mm)')
 
 
 @pytest.mark.parametrize(('left', 'limit', 'said'), [(2e-5, 1e-5, '0.020'), (2.0, 0.01, '2000')])
