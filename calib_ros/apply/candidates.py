@@ -43,6 +43,8 @@ class Visibility:
             far = () if given is None or self.world else np.abs(given).ravel()
             if any(100.0 < each < np.inf for each in far):
                 raise ConfigError(f'the {name} must be in metres (300 mm is 0.3), not {given}')
+        if self.tracker is not None and not np.isfinite(self.tracker).all():
+            raise ConfigError(f'the tracker must be at a place in metres, not at {self.tracker}')
         if not np.linalg.norm(self.axis) > 0.0:
             raise ConfigError('the axis of the target must not be 0 0 0')
         if not 0.0 < self.cone <= np.pi:

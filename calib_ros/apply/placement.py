@@ -16,12 +16,13 @@ import numpy as np
 from calib_ros.annotated import Count, as_annotated
 from calib_ros.apply.candidates import refuse_empty
 from calib_ros.apply.task import Search
-from calib_ros.errors import InputError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Model, Objective
 from calib_ros.shown import Shown
+from calib_ros.values import LARGEST
 
 AROUND = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
 """Steps to the neighbours on a grid."""
@@ -68,6 +69,13 @@ def place(
     search = Search(arm, task, aim, model, progress)
     corners = search.reach if region is None else region
     refuse_empty('region', corners)
+    if (np.abs(corners) > 100.0).any():
+        raise ConfigError(f'the region must be in metres (300 mm is 0.3), not {corners.tolist()}')
+    if cells**3 * turns > LARGEST:
+        raise ConfigError(
+            f'{cells} cells along each axis and {turns} turns are {cells**3 * turns:,} '
+            f'placements; the limit is {LARGEST:,.0f}: give fewer'
+        )
     axes = [np.linspace(low, high, cells) for low, high in corners.T]
     angles = 2.0 * np.pi * np.arange(turns) / turns
     grid = np.stack(np.meshgrid(*axes, angles, indexing='ij'), axis=-1).reshape(-1, 4)

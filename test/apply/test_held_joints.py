@@ -54,6 +54,15 @@ def path():
     return q, np.gradient(q, t, axis=0)
 
 
+@pytest.mark.parametrize('wanted', [('--poses', 6), ('--iso9283',)])
+def test_a_joint_locked_off_zero_is_planned_where_it_is(run, tmp_path, wanted):
+    """It was refused, as if it had been measured at zero."""
+    (tmp_path / 'locked.yaml').write_text(dump_chain(LOCKED))
+    status, _, err = run('plan', '--chain', 'locked.yaml', *wanted, '--out', 'plan.csv')
+    assert (status, err) == (0, '')
+    assert (read_joints(tmp_path / 'plan.csv', LOCKED)[:, 2] == HELD.lower).all()
+
+
 def test_a_locked_joint_does_not_count_as_moving(rng):
     assert mobility(LOCKED)[0] == 6
     small = tuple(replace(each, a=0.01 * each.a, d=0.01 * each.d) for each in PALLETISER.joints)

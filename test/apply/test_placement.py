@@ -65,6 +65,8 @@ def test_the_best_placement_beats_the_centre_on_the_true_arm(cell, arm, placed, 
         ({'model': 'best'}, 'unknown model "best"'),
         ({'cells': 0}, 'cells must be at least 1, not 0'),
         ({'turns': 0}, 'turns must be at least 1, not 0'),
+        ({'cells': 10**7}, 'cells along each axis .* the limit is 1,000,000: give'),
+        ({'region': np.array([[0, 0, 0], [1e300, 1, 1]])}, 'the region must be in metres'),
     ],
 )
 def test_what_no_search_could_be_of_is_refused(arm, given, said):

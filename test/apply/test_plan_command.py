@@ -66,6 +66,9 @@ def test_a_region_out_of_reach_is_refused(rng):
         Visibility(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]]))
     with pytest.raises(ConfigError, match='axis'):
         Visibility(axis=(0.0, 0.0, 0.0))
+    for x in (np.nan, np.inf):
+        with pytest.raises(ConfigError, match='the tracker must be at a place in metres'):
+            Visibility(tracker=np.array([x, 0.0, 1.0]))
 
 
 def test_places_in_mm_are_refused():
