@@ -107,7 +107,7 @@ def _scale(problem: Problem, result: Identification) -> Iterator[Reason]:
         return
     certain = problem.sigma_scale and found.rival and special.expit(found.rival[0]) > CERTAIN
     if region.by_scale >= HARMFUL or certain:
-        text = out_of_scale(found.scale, checked=bool(problem.sigma_scale))
+        text = out_of_scale(found.scale, False, bool(problem.sigma_scale), found.strain)
         yield Reason(Rule.SCALE, result.strain or text)
 
 

@@ -9,17 +9,29 @@ import numpy as np
 from calib_ros.estimation.levels import LARGEST_SCALE, SCALE
 
 
-def out_of_scale(scale: float, printed: bool = False, checked: bool = False) -> str:
+def out_of_scale(
+    scale: float, printed: bool = False, checked: bool = False, strain: float = 0.0
+) -> str:
     """Return that a scale of the device, given minus one, may make the calibrated arm worse.
 
-    Of a `printed` board it is that of its stated size.
+    Of a `printed` board it is that of its stated size. Linear joints imitate a `strain`, by which
+    it differs with the direction.
     """
     way, size = ('grow', 'large') if scale > 0.0 else ('shrink', 'small')
     grown = f'all lengths of the arm {way} alike, by {percent(abs(scale))} %'
+    if strain > abs(scale):
+        grown = f'lengths come out {percent(strain)} % longer in one direction than in another'
     if checked:
         return (
             f'{grown}, more than sigma_scale allows: measure a known length, or the printed '
             'board, again'
+        )
+    if strain > abs(scale):
+        return (
+            f'{grown}, by the linear joints or by the measuring device; if by the device, the '
+            'correction may make the arm worse. Check its scale along each linear joint with a '
+            'known length: if it is right, set sigma_scale (--sigma-scale) to its accuracy, and '
+            'fit the scale of the joints (model auto)'
         )
     text = f'{grown}, as if the measuring device were out of scale; then'
     check, what, usual = 'If a known length shows that its', 'scale of the device', SCALE

@@ -5,8 +5,7 @@
 No arm does, not even one that bends, unless its linear joints, or lengths that are held, are out
 of scale. So it shows in the residuals: a volume calibrated badly, a wrong focal length, or a wrong
 radius of the reflector. Such a device is hardly true to scale either, which does not show: lengths
-of the arm follow it. If its three directions are off independently by s, the scale is off by s /
-3^(1/2), and the strain without it, a symmetric matrix, has the length 2^(1/2) s.
+of the arm follow it.
 """
 
 from __future__ import annotations
@@ -16,62 +15,57 @@ import numpy as np
 from calib_ros.decision.scale import percent
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.considered import CONSIDERED, considered, held_frames, travels
-from calib_ros.estimation.distortion import device_sigma, shift_rows
+from calib_ros.estimation.distortion import differing, strains
 from calib_ros.estimation.fitted import Fitted
-from calib_ros.estimation.gain import gain_of
+from calib_ros.estimation.gain import gain_of, gain_share
 from calib_ros.estimation.levels import SURE, chance_of
-from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.system import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 
-_PAIRS = ((0, 1), (0, 2), (1, 2))
-STRAINS = np.array(
-    [
-        *(np.diag(each) for each in ((1.0, -1.0, 0.0), (1.0, 1.0, -2.0))),
-        *(np.outer(*np.eye(3)[[i, j]]) + np.outer(*np.eye(3)[[j, i]]) for i, j in _PAIRS),
-    ]
-)
-"""Symmetric matrices (5, 3, 3) without trace: the others turn or scale space."""
 
+def strain_of(fitted: Fitted) -> tuple[str, float]:
+    """Return the strain of the only device in words, and the share of the residuals it explains.
 
-def strain_of(fitted: Fitted) -> tuple[float, str]:
-    """Return the standard deviation of the scale of a strained device, and the strain in words.
-
-    Zero and nothing unless a strain of the only device explains most of the residuals that usual
-    eccentricity and a usual sag of the arm leave, with whatever is held and any scale of travel.
+    A strain explains most of the residuals that usual eccentricity and a usual sag of the arm
+    leave, with whatever is held and any scale of travel. The share is that of a scale of travel,
+    with the strain if there is one, or zero if it is not most.
     """
     problem, names = fitted.problem, fitted.names
     pairs = zip(problem.sets, fitted.robust.inliers, strict=True)
-    sets = [each.select(good).spread() for each, good in pairs]
-    devices = {each.tool if each.inverse else each.base for each in sets}
-    positions = (
-        each.distances is None and each.pixels is None and not each.socket for each in sets
-    )
-    if len(devices) > 1 or not all(positions):
-        return 0.0, ''
+    system = problem.system([each.select(good).spread() for each, good in pairs])
+    strained = strains(system.sets)
+    if not (travels(fitted.chain) or any(each.any() for each in strained)):
+        return '', 0.0
     more = _beside(fitted)
-    system, columns = problem.system(sets), [*names, *more]
+    columns, count = [*names, *more], len(names) + len(more)
     own = (n for n in more if not (n.of_dh or problem.model.owns_frame(n)))
     chain = fitted.chain.with_effects([*own])
-    rows = stacked(list(map(_with_strains, system.rows_of(chain, columns), system.sets)))
+    rows = stacked(list(map(_with_strains, system.rows_of(chain, columns), strained)))
+    free = [*range(len(names)), *(k for k, n in enumerate(columns) if n in travels(chain))]
     given, back = system.extra_rows(chain, columns)
     usual = np.diag([0.0] * len(names) + [1.0 / size for size in more.values()])
     known = np.zeros((len(given) + len(usual), rows.shape[1]))
-    known[:, : len(columns)], known[: len(given), -1] = np.vstack([given, usual]), back
-    rows = np.vstack([rows, known])
-    squares, rank, left = gain_of(rows.T @ rows, len(columns))
+    known[:, :count], known[: len(given), -1] = np.vstack([given, usual]), back
+    text = _in_words(np.vstack([rows, known]), count)
+    free += range(count, rows.shape[1]) if text else [rows.shape[1] - 1]
+    share = gain_share(rows[:, [*dict.fromkeys(free)]], len(names))
+    return text, share if EXPLAINED < share < 1.0 else 0.0
+
+
+def _in_words(rows: FloatArray, count: int) -> str:
+    """Return what strains explain beside the first `count` columns, if it is most."""
+    squares, rank, left = gain_of(rows.T @ rows, count)
     share = squares / left if left > 0.0 else 0.0
     if not EXPLAINED < share < 1.0:
-        return 0.0, ''
+        return ''
     free = np.count_nonzero(rows[:, :-1].any(axis=1)) - np.linalg.matrix_rank(rows[:, :-1])
     if free <= 0 or chance_of(share / (1.0 - share) * free, rank, free) > 1.0 - SURE:
-        return 0.0, ''
-    found = np.linalg.lstsq(rows[:, :-1], rows[:, -1], HALF_THE_DIGITS)[0][len(columns) :]
-    strain = np.tensordot(found, STRAINS, 1)
-    size = percent(float(np.ptp(np.linalg.eigvalsh(strain))))
-    return float(np.linalg.norm(strain)) / 6.0**0.5, (
+        return ''
+    found = np.linalg.lstsq(rows[:, :-1], rows[:, -1], HALF_THE_DIGITS)[0][count:]
+    size = percent(differing(np.asarray(found)))
+    return (
         f'in one direction of the measuring device lengths come out {size} % longer than in '
         f'another, which explains {100.0 * share:.0f} % of the residuals: its scale may be off as '
         'well. Calibrate it again (its volume or lens, or the radius of the reflector)'
@@ -88,12 +82,8 @@ def _beside(fitted: Fitted) -> dict[Parameter, float]:
     return found | {name: np.inf for name in held if name.of_dh or name in unknown}
 
 
-def _with_strains(rows: FloatArray, samples: Samples) -> FloatArray:
-    """Return rows (P + 1, c, N) with those of strains before the residual."""
-    seen = samples.observations
-    weights = np.ones(samples.count) if samples.weights is None else samples.weights
-    places = weights * (seen.given - seen.given.mean(axis=0)).T / device_sigma(samples)
-    along = shift_rows(samples, places).reshape(3, 3, -1, samples.count)
-    added = np.zeros((len(STRAINS), *rows.shape[1:]))
-    added[:, : along.shape[2]] = np.einsum('kma,macn->kcn', STRAINS, along)
+def _with_strains(rows: FloatArray, strained: FloatArray) -> FloatArray:
+    """Return rows (P + 1, c, N) with strains (5, w, N) before the residual."""
+    added = np.zeros((len(strained), *rows.shape[1:]))
+    added[:, : strained.shape[1]] = strained
     return np.concatenate([rows[:-1], added, rows[-1:]])

@@ -13,6 +13,18 @@ from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics.se3 import FloatArray
 
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+_STRAINS = np.array(
+    [
+        *(np.diag(each) for each in ((1.0, -1.0, 0.0), (1.0, 1.0, -2.0))),
+        *(np.outer(*np.eye(3)[[i, j]]) + np.outer(*np.eye(3)[[j, i]]) for i, j in _PAIRS),
+    ]
+)
+STRAINS = _STRAINS * np.sqrt(1.2 / (_STRAINS**2).sum(axis=(1, 2), keepdims=True))
+"""Symmetric matrices (5, 3, 3) without trace: the others turn or scale space. If three directions,
+whichever they are, are off independently by s, the scale is off by s / 3^(1/2), and the strain, of
+length 2^(1/2) s, by as much in each of these."""
+
 
 def bends(sets: Sequence[Samples]) -> list[FloatArray]:
     """Return the possible device distortions of each set (K, c, N), weighted as position rows.
@@ -40,6 +52,32 @@ def bends(sets: Sequence[Samples]) -> list[FloatArray]:
             bent = shift_rows(samples, parts[k]) if k in parts else none
             found[k] = np.concatenate([found[k], bent])
     return found
+
+
+def strains(sets: Sequence[Samples]) -> list[FloatArray]:
+    """Return strains of the device for each set (5, c, N), weighted as position rows.
+
+    They are zero unless a single device measures all positions.
+    """
+    found, shown = [], [samples.observations for samples in sets]
+    alone = len({each.tool if each.inverse else each.base for each in shown}) == 1
+    if any(s.distances is not None or s.pixels is not None or s.socket for s in shown):
+        alone = False
+    for samples, seen in zip(sets, shown, strict=True):
+        weights = np.ones(samples.count) if samples.weights is None else samples.weights
+        rows = np.zeros((len(STRAINS), samples.width, samples.count))
+        if alone:
+            places = weights * (seen.given - seen.given.mean(axis=0)).T / device_sigma(samples)
+            along = shift_rows(samples, places).reshape(3, 3, -1, samples.count)
+            rows = np.einsum('kma,macn->kcn', STRAINS, along)
+        found.append(rows)
+    return found
+
+
+def differing(coefficients: FloatArray) -> float:
+    """Return by how much more a strain, a sum of STRAINS (5,) or none, stretches one direction."""
+    strain = np.tensordot(coefficients, STRAINS[: len(coefficients)], 1)
+    return float(np.ptp(np.linalg.eigvalsh(strain)))
 
 
 def _polynomials(places: FloatArray, weights: FloatArray) -> FloatArray:

@@ -25,7 +25,8 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from calib_ros.estimation.considered import lengths_of, lenses
+from calib_ros.estimation.considered import lengths_of, lenses, travels
+from calib_ros.estimation.distortion import STRAINS, differing
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import about_nominal
 from calib_ros.estimation.joint_errors import Unmodelled
@@ -43,16 +44,17 @@ class Inference:
     """What the posterior of a fit and of `more` considered effects follows from.
 
     Offsets from the nominal chain are normal about zero. The samples have their weights in the
-    fit, at which all is linear, and noise of size `noise` [sigma given]. `rounding` are standard
-    deviations of parameters that rounded joint values move too, `scale` is the least one of the
-    scale of the device.
+    fit, at which all is linear, and noise of size `noise` [sigma given]; without what the scale of
+    linear joints explains, and a strain of the device if it is `strained`, that is `least`.
+    `rounding` are standard deviations of parameters that rounded joint values move too.
     """
 
     fitted: Fitted
     noise: float
     more: Sequence[str] = ()
     rounding: Mapping[str, float] = field(default_factory=dict)
-    scale: float = 0.0
+    strained: bool = False
+    least: float = 0.0
 
     @cached_property
     def _without_waves(self) -> _Columns:
@@ -78,34 +80,47 @@ class Inference:
     def with_mixture(self, posterior: Posterior) -> Posterior:
         """Return its posterior with the arms that may have given the data.
 
-        Its axes may wobble by the `unmodelled` waves, and the device may be out of scale.
+        Its axes may wobble by the `unmodelled` waves, and the device may be out of scale, and also
+        strained, if it is or if linear joints look alike. If it is, errors are those of the arm
+        itself, not as the device sees it.
         """
         waves, fitted = posterior.unmodelled.waves, self.fitted
-        columns = _Columns(self, waves) if waves else self._without_waves
+        noisy = self.least > HALF_THE_DIGITS  # as all that is measured
+        strained = self.strained or (noisy and bool(travels(fitted.chain)))
+        again = replace(self, noise=self.least) if strained else self
+        columns = _Columns(again, waves, strained) if waves or strained else self._without_waves
         (evidence, size, wider, near), arm = columns.plausible, columns.arm
-        rival, scale, checked = None, 0.0, bool(fitted.problem.sigma_scale)
+        rival, device, checked = None, np.zeros(1), bool(fitted.problem.sigma_scale)
         if columns.scaled and fitted.held is None and (checked or columns.scale < PRINTED):
             elsewhere = columns.evidence(max(OUT_OF_SCALE, columns.scale))
             odds, mean, covariance = elsewhere.odds_against(evidence, size, columns.considered)
             # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
             odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
-            rival, scale = (odds, mean[arm], covariance[arm, arm]), float(mean[-1])
+            rival, device = (odds, mean[arm], covariance[arm, arm]), mean[arm.stop :]
         found = [(w, *solved(*columns.normal, wider.precision(each))) for w, each in near]
+        if self.strained:
+            own, weights = np.s_[: len(posterior.names)], [weight for weight, _ in near]
+            mean, covariance = mixed([(mean[own], root[own]) for _, mean, root in found], weights)
+            posterior = replace(
+                posterior, shift=mean - columns.offsets[own], covariance=covariance
+            )
         mixture = [(w, mean[arm], root[arm] @ root[arm].T) for w, mean, root in found]
         if fitted.held is not None:  # nothing measures the scale
             mixture = [posterior.with_held(each, *fitted.held) for each in mixture]
         elif columns.scaled and rival is None:
-            scale = float(found[0][1][-1])
-        return replace(posterior, mixture=tuple(mixture), rival=rival, scale=scale)
+            device = found[0][1][arm.stop :]
+        scale, strain = float(device[-1]), differing(device[:-1])
+        likely = tuple(mixture)
+        return replace(posterior, mixture=likely, rival=rival, scale=scale, strain=strain)
 
 
 class _Columns:
-    """Columns of the arm, then of its waves, then of the scale of a device that lengths have.
+    """Columns of the arm, of its waves, of strains, and of the scale of a device with lengths.
 
     With the products of their rows for noise of a size.
     """
 
-    def __init__(self, given: Inference, waves: float = 0.0) -> None:
+    def __init__(self, given: Inference, waves: float = 0.0, strained: bool = False) -> None:
         fitted, more = given.fitted, given.more
         problem, names, system = fitted.problem, fitted.names, fitted.system
         own = [n for n in more if not (Parameter(n).of_dh or problem.model.owns_frame(n))]
@@ -113,17 +128,19 @@ class _Columns:
         beside = {name: std for name, std in given.rounding.items() if name in names}
         whole, lengths, self.scale = self.chain, dict[str, float](), SCALE
         if more:
-            whole, lengths, scale = lengths_of(self.chain, system)
-            self.scale = max(scale, given.scale)
+            whole, lengths, self.scale = lengths_of(self.chain, system)
+        strained &= bool(lengths)
         noise = max(given.noise, HALF_THE_DIGITS)  # parameters that follow all exactly leave none
         if more or beside or waves:
-            nuisances = Nuisances(beside, lengths, bool(more), Unmodelled(waves=waves), kept=True)
+            unmodelled = Unmodelled(waves=waves)
+            nuisances = Nuisances(beside, lengths, bool(more), unmodelled, True, strained)
             self.sums = nuisance_products(whole, self.names, system, nuisances, noise)
         else:
             plain = fitted.products / noise**2
             self.sums = NuisanceProducts(plain, plain[:, :0], plain[:0, :0])
         self.scaled, count = bool(lengths), len(self.sums.plain) - 1
-        self.arm = slice(0, count - self.scaled)  # with waves, in units of their size
+        self._device = self.scaled + strained * len(STRAINS)
+        self.arm = slice(0, count - self._device)  # with waves, in units of their size
         self.offsets = np.append(fitted.offsets, np.zeros(count - len(names)))
         self.normal = about_nominal(self.sums.reduced[:-1], self.offsets)
         known: dict[str, float] = {**problem.given} | {**lenses(problem.model)}
@@ -132,18 +149,17 @@ class _Columns:
         groups = [None if name in known else sized[name] for name in self.names]
         self.considered = {*groups[len(names) :]} - {*groups[: len(names)]}
         rest = self.arm.stop - len(groups)  # waves
-        self._checked = problem.sigma_scale and max(problem.sigma_scale, given.scale)
+        self._checked = 0.0 if given.strained else problem.sigma_scale
         self._groups = groups + [None] * rest
         self._given = [known.get(name, np.inf) for name in self.names] + [1.0] * rest
 
     def evidence(self, scale: float | None = None) -> Evidence:
         """Return the evidence; with another usual `scale` of the device that nobody checked."""
         typical = TYPICAL | {'scale': self.scale if scale is None else scale}
-        groups, given = self._groups, self._given
-        if self.scaled:
-            checked = scale is None and self._checked
-            groups, given = [*groups, None if checked else 'scale'], [*given, checked or np.inf]
-        return Evidence(*self.normal, np.array(given) ** -2.0, groups, typical)
+        checked = self._checked if scale is None else 0.0
+        groups = self._groups + [None if checked else 'scale'] * self._device
+        given = np.array(self._given + [checked or np.inf] * self._device)
+        return Evidence(*self.normal, given**-2.0, groups, typical)
 
     @cached_property
     def plausible(self) -> tuple[Evidence, FloatArray, Evidence, list[tuple[float, FloatArray]]]:

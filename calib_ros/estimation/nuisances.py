@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg
 
-from calib_ros.estimation.distortion import bends
+from calib_ros.estimation.distortion import STRAINS, bends, strains
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled, axis_parameters
 from calib_ros.estimation.normal import products_of
 from calib_ros.estimation.observations import SOME_POSES
@@ -35,7 +35,7 @@ class Nuisances:
     Parameters by `sizes` that something else moves too, all `lengths` together with the scale of
     the device, smooth errors of the device if `by_device`, and `unmodelled` waves beside what the
     parameters follow of them; if `kept`, waves are no nuisances but parameters, in units of their
-    size.
+    size. So are strains of the device if `strained`.
     """
 
     sizes: Mapping[str, float] = field(default_factory=dict)
@@ -43,14 +43,15 @@ class Nuisances:
     by_device: bool = False
     unmodelled: Unmodelled = NOTHING
     kept: bool = False
+    strained: bool = False
 
 
 class NuisanceProducts(NamedTuple):
     """Products of columns and residual (Q, Q), and with K doubtful columns (Q, K) and (K, K).
 
-    The columns are those of the parameters, of waves if kept, of the device's scale if there are
-    lengths, and of the residual. Doubtful ones are scaled by their standard deviations; their own
-    products have 1 added.
+    The columns are those of the parameters, of waves if kept, of the device's strains if it may be
+    strained, of its scale if there are lengths, and of the residual. Doubtful ones are scaled by
+    their standard deviations; their own products have 1 added.
     """
 
     plain: FloatArray
@@ -91,9 +92,12 @@ def nuisance_products(
         return every[:, [row[str(name)] for name in sizes]] * [*sizes.values()]
 
     grown = scaled(nuisances.lengths).sum(axis=1, keepdims=True)[:, : len(nuisances.lengths)]
-    end = own + _waves(chain, nuisances) * nuisances.kept
-    kept = np.column_stack([every[:, :count], every[:, own:end], grown, every[:, own - 1]])
-    mixing = np.column_stack([kept, scaled(nuisances.sizes), every[:, end:]])
+    waved = own + _waves(chain, nuisances)
+    bent = waved + len(STRAINS) * nuisances.strained
+    arm, _, left, wobble, strain, smooth = np.split(every, [count, own - 1, own, waved, bent], 1)
+    end = wobble.shape[1] * nuisances.kept
+    kept = np.column_stack([arm, wobble[:, :end], strain, grown, left])
+    mixing = np.column_stack([kept, scaled(nuisances.sizes), wobble[:, end:], smooth])
     mixed = mixing.T @ (products / noise**2) @ mixing
     first, rest = np.s_[: kept.shape[1]], np.s_[kept.shape[1] :]
     doubtful = mixed[rest, rest]
@@ -113,6 +117,9 @@ def _products(
     unmodelled = nuisances.unmodelled
     none = [np.zeros((0, samples.width, samples.count)) for samples in system.sets]
     fields = bends(system.sets) if nuisances.by_device else none
+    if nuisances.strained:
+        pairs = zip(strains(system.sets), fields, strict=True)
+        fields = [np.concatenate(pair) for pair in pairs]
     waves = _waves(chain, nuisances)
     if not (any(map(len, fields)) or waves):
         return np.asarray(products_of(chain, columns, system)[0].sum(axis=0))

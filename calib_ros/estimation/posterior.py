@@ -47,6 +47,8 @@ class Posterior(Shown):
     printed board of unchecked scale, which may be."""
     scale: float = 0.0
     """The scale of that device or board, minus one."""
+    strain: float = 0.0
+    """By how much it is larger in one direction than in another."""
     unmodelled: Unmodelled = NOTHING
     """What none of the names explains (`unmodelled.py`)."""
 

@@ -89,8 +89,9 @@ def _identified(
     validation, validated_by = validate(fitted, before.chain, explained)
     coarse, share = rounded_joints(problem), coupling_share(fitted)
     more = considered(chain, names, problem.fixed, problem.sets)
-    (scale, strain), coarsely = strain_of(fitted), rounding_errors(problem, coarse)
-    inference = Inference(fitted, _size(fitted, share), more, coarsely, scale)
+    (strain, beside), coarsely = strain_of(fitted), rounding_errors(problem, coarse)
+    noise, least = (_size(fitted, max(share, each)) for each in (0.0, beside))
+    inference = Inference(fitted, noise, more, coarsely, bool(strain), least)
     posterior, uncertainty = _inferred(inference)
     surprise, wider = held_out_excess(fitted, posterior, validation)
     uncertainty = replace(uncertainty, parts=wider**2 * uncertainty.parts)
@@ -168,10 +169,10 @@ def _region(
     region = of(posterior.widened(wider))
     printed = all(each.pixels is not None for each in problem.sets)
     finer = SCALE if printed else EXCEPTION * SCALE  # as of a tracker
-    doubtful = inference.scale > 0.0 or not 0.0 < problem.sigma_scale <= finer
+    doubtful = inference.strained or not 0.0 < problem.sigma_scale <= finer
     if region is None and posterior.scale and doubtful:
         checked = replace(fitted, problem=replace(problem, sigma_scale=finer))
-        known = replace(inference, fitted=checked, scale=0.0).with_mixture(posterior)
+        known = replace(inference, fitted=checked, strained=False).with_mixture(posterior)
         if of(known.widened(wider)) is not None:
             return None, posterior.scale
     return region, 0.0

@@ -80,7 +80,7 @@ def test_a_device_out_of_scale_is_told_where_it_harms_or_was_checked(change, tol
         refusals=given['refusals'],
         strain=given['strain'],
         region=SimpleNamespace(by_scale=given['by_scale']),
-        posterior=SimpleNamespace(rival=(given['odds'], (), ()), scale=given['scale']),
+        posterior=SimpleNamespace(rival=(given['odds'], (), ()), scale=given['scale'], strain=0.0),
     )
     found = [*plausibility._scale(SimpleNamespace(sigma_scale=given['sigma_scale']), result)]
     assert told in ' '.join(found)
