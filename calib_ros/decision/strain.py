@@ -18,8 +18,9 @@ from calib_ros.estimation.considered import CONSIDERED, considered, held_frames,
 from calib_ros.estimation.distortion import differing, strains
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import gain_of, gain_share
+from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.levels import SURE, chance_of
-from calib_ros.estimation.system import stacked
+from calib_ros.estimation.system import System, stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
@@ -30,7 +31,7 @@ def strain_of(fitted: Fitted) -> tuple[str, float]:
 
     A strain explains most of the residuals that usual eccentricity and a usual sag of the arm
     leave, with whatever is held and any scale of travel. The share is that of a scale of travel,
-    with the strain if there is one, or zero if it is not most.
+    with the strain if there is one, or zero if it is not most or frames are held.
     """
     problem, names = fitted.problem, fitted.names
     pairs = zip(problem.sets, fitted.robust.inliers, strict=True)
@@ -42,6 +43,9 @@ def strain_of(fitted: Fitted) -> tuple[str, float]:
     columns, count = [*names, *more], len(names) + len(more)
     own = (n for n in more if not (n.of_dh or problem.model.owns_frame(n)))
     chain = fitted.chain.with_effects([*own])
+    if held := [name for name in more if problem.model.owns_frame(name)]:  # maybe far off
+        system = System(system.sets)  # whose noise was not that of the priors
+        chain = minimise(chain, [*names, *held], system).chain
     rows = stacked(list(map(_with_strains, system.rows_of(chain, columns), strained)))
     free = [*range(len(names)), *(k for k, n in enumerate(columns) if n in travels(chain))]
     given, back = system.extra_rows(chain, columns)
@@ -51,7 +55,7 @@ def strain_of(fitted: Fitted) -> tuple[str, float]:
     text = _in_words(np.vstack([rows, known]), count)
     free += range(count, rows.shape[1]) if text else [rows.shape[1] - 1]
     share = gain_share(rows[:, [*dict.fromkeys(free)]], len(names))
-    return text, share if EXPLAINED < share < 1.0 else 0.0
+    return text, share if EXPLAINED < share < 1.0 and not held else 0.0
 
 
 def _in_words(rows: FloatArray, count: int) -> str:

@@ -137,16 +137,21 @@ def test_linear_joints_do_not_hide_that_a_strained_device_may_harm(seed, size):
         assert 'one direction' in refusal
 
 
-@pytest.mark.parametrize('fixed', ['*.a', 'base.*'])
-def test_what_is_held_at_wrong_values_is_no_strain_of_the_device(fixed):
+@pytest.mark.parametrize(
+    ('fixed', 'seed', 'off'), [('*.a', 1, 0.0), ('base.*', 1, 3e-3), ('base.*', 0, 3e-2)]
+)
+def test_what_is_held_at_wrong_values_is_no_strain_of_the_device(fixed, seed, off):
     """Its lengths look stretched in the plane of a SCARA, or a base that is tilted."""
-    _, true, seen = measured_arm(1, 40, chain=SCARA, oriented=False)
+    _, true, seen = measured_arm(seed, 40, chain=SCARA, oriented=False)
     chain, held = SCARA, (fixed,)
     if fixed == 'base.*':
         tilted = true.base.matrix.copy()
-        tilted[:3, :3] @= se3.exp_rotation(np.full((1, 3), 3e-3))[0]
+        tilted[:3, :3] @= se3.exp_rotation(np.full((1, 3), off))[0]
         chain, held = replace(SCARA, base=Frame(tilted, fixed=True)), ()
     assert strain_of(fit(Problem(chain, seen, fixed=held, **SIGMAS))) == ('', 0.0)
+    if off:
+        problem = Problem(chain, stretched(seen, 2e-3, axis=1), **SIGMAS)
+        assert strain_of(fit(problem))[0].startswith(TOLD[:-3])
 
 
 def test_no_height_of_the_target_is_asked_for_tilts_below_any_device():
