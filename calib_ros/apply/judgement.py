@@ -24,6 +24,7 @@ from calib_ros.apply.confidence import limits_of, moments_of
 from calib_ros.decision import mistakes
 from calib_ros.decision.comparison import Comparison, along_base, compare
 from calib_ros.decision.diagnosis import Diagnosis
+from calib_ros.decision.trials import largest_error
 from calib_ros.errors import MOST_ENTRIES
 from calib_ros.estimation.levels import CLEARLY, CONFIDENT
 from calib_ros.estimation.observations import Observations
@@ -167,9 +168,10 @@ def _noise_beyond(arm: Calibration, sets: Sequence[Observations], stated: float 
 def _mistake(
     arm: Calibration, sets: Sequence[Observations], error: float, angle: float, of_messages: bool
 ) -> Diagnosis | None:
-    if error <= Settings.largest_error and angle <= Settings.largest_angle:
-        return None
     problem = Problem(arm.before, sets[0], more=sets[1:], of_messages=of_messages)
+    most = largest_error(problem)
+    if error <= most and angle <= problem.largest_angle:
+        return None
     found = mistakes.diagnose(problem, far=True) or mistakes.diagnose_alone(problem, arm.chain)
-    known = error > Settings.largest_error or (found and found.alone)  # else positions fit
+    known = error > most or (found and found.alone)  # else positions fit
     return found if known else None

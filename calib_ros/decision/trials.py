@@ -114,8 +114,13 @@ def largest_error(problem: Problem) -> float:
 
 
 def largest_of(problem: Problem) -> float:
-    """Return the largest error [m] of a faulty arm, with that of its orientation."""
-    return problem.largest_error + LEVER * problem.largest_angle / 3.0
+    """Return the largest error [m] of a faulty arm, with that of its orientation.
+
+    Of positions alone in proportion to the arm, if it is tiny.
+    """
+    most, turned = problem.largest_error, any(each.oriented.any() for each in problem.sets)
+    tiny = 1.0 if turned else largest_error(problem) / most
+    return tiny * (most + LEVER * problem.largest_angle / 3.0)
 
 
 def fits_each_side(problem: Problem, seen: Observations, stamp_ns: int) -> bool:

@@ -10,8 +10,10 @@ from fits import UR10E
 
 from calib_ros import Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.verification import verify
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.trials import largest_error
+from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 
@@ -42,6 +44,16 @@ def test_a_mistake_is_named_although_the_arm_is_less_than_a_centimetre_off():
     assert found.fitted.figures_of_all[0].rms_mm < 10.0
     assert found.refusals[0].rule == Rule.MISTAKE
     assert 'wrist_2_joint is not given against wrist_1_joint' in found.refusals[0]
+
+
+@pytest.mark.parametrize('wrong', [False, True])
+def test_so_it_is_where_it_is_verified(wrong):
+    """It failed, 5.9 mm off, without a word."""
+    seen = seen_of()
+    arm = Calibration.of(identify(Problem(TINY, seen, **SIGMAS)))
+    found = verify(arm, [coupled(seen) if wrong else seen], 1e-5, sigma_position=NOISE[0])
+    assert found.verdict == ('no verdict' if wrong else 'PASS')
+    assert ('against wrist_1_joint' in str(found.mistake)) == wrong
 
 
 @pytest.mark.parametrize('oriented', [False, True])
