@@ -31,7 +31,6 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.se3 import Index
-from calib_ros.settings import Settings
 from calib_ros.shown import rounded
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']

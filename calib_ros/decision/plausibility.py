@@ -9,12 +9,10 @@ arm, not just a less accurate one, so the result is refused.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from scipy import special
 
 from calib_ros.decision.delays import uneven
 from calib_ros.decision.lost_rows import computed_rows
@@ -23,7 +21,7 @@ from calib_ros.decision.printed_board import stretched
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.risk import SHELL
-from calib_ros.decision.scale import out_of_scale
+from calib_ros.decision.scale import scale_reasons
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.errors import CalibrationError, InputError
 from calib_ros.estimation.configurations import count_distinct
@@ -31,7 +29,7 @@ from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.gauges import best_imitation
 from calib_ros.estimation.gross_errors import SUSPICIOUS
 from calib_ros.estimation.identifiability import DEGENERATE
-from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, NEARER, SURE, TELLING, chance_of
+from calib_ros.estimation.levels import ALIKE, CLEARLY, NEARER, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.sizes import TYPICAL
@@ -45,9 +43,6 @@ from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXACT, EXCEPTION, LEVER, Settings
 from calib_ros.shown import some
 
-HARMFUL = 0.15
-"""Probability of harm by the device's scale at which a result is refused: of 630 good ones 23 are;
-of 1,890 arms with a scale of 0.1 to 0.3 % 59 are accepted and get worse (benchmarks/scale.py)."""
 LEAST_NOISE = NEARER * EXCEPTION
 """Residuals in units of the given sigmas below which these are wrong: clearly less than a
 tenth, the ratio of a device's repeatability to its accuracy; mm would be thousandths."""
@@ -68,13 +63,16 @@ def add_remarks(problem: Problem, result: Identification, another: bool = True) 
     `another` is false if a mistake is already named, which comes first.
     """
     if all(each.socket or each.plane for each in problem.sets):  # shows only the scale of a bar
-        refused = _scale(problem, result) if problem.separations else []
+        refused = scale_reasons(problem, result) if problem.separations else []
         return replace(result, refusals=(*result.refusals, *refused))
     result = _lag(problem, result)
     late = any(each.rule is Rule.LAG for each in result.refusals)
     lens, imitated = _lens(problem, result) if another and not late else ('', False)
     board = '' if lens else stretched(problem, result)
-    sigmas, refusals = _sigmas(problem, result), [*result.refusals, *_scale(problem, result)]
+    sigmas, refusals = (
+        _sigmas(problem, result),
+        [*result.refusals, *scale_reasons(problem, result)],
+    )
     if board and all(each.pixels is not None for each in problem.sets):
         refusals.insert(0, Reason(Rule.SCALE, board))  # before what follows for its size
         board = ''
@@ -95,20 +93,6 @@ def add_remarks(problem: Problem, result: Identification, another: bool = True) 
     found = (other, lens, board, strain, judged, coupled, level, loose, motion, order, sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=remarks, refusals=tuple(refusals))
-
-
-def _scale(problem: Problem, result: Identification) -> Iterator[Reason]:
-    """Yield that a device out of scale does harm or is too likely to, if nothing else refuses.
-
-    Also if its scale was checked, but almost certainly is not what `sigma_scale` states.
-    """
-    region, found = result.region, result.posterior
-    if result.refusals or region is None:
-        return
-    certain = problem.sigma_scale and found.rival and special.expit(found.rival[0]) > CERTAIN
-    if region.by_scale >= HARMFUL or certain:
-        text = out_of_scale(found.scale, False, bool(problem.sigma_scale), found.strain)
-        yield Reason(Rule.SCALE, result.strain or text)
 
 
 def _arm_distance(chain: Chain, found: Chain, joints: FloatArray) -> float:

@@ -14,6 +14,7 @@ from calib_ros.apply.simulation import measure
 from calib_ros.decision import plausibility, validation
 from calib_ros.decision.misfits import loose_target
 from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision.scale import scale_reasons
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import TELLING
 from calib_ros.estimation.observations import Observations
@@ -82,7 +83,7 @@ def test_a_device_out_of_scale_is_told_where_it_harms_or_was_checked(change, tol
         region=SimpleNamespace(by_scale=given['by_scale']),
         posterior=SimpleNamespace(rival=(given['odds'], (), ()), scale=given['scale'], strain=0.0),
     )
-    found = [*plausibility._scale(SimpleNamespace(sigma_scale=given['sigma_scale']), result)]
+    found = [*scale_reasons(SimpleNamespace(sigma_scale=given['sigma_scale']), result)]
     assert told in ' '.join(found)
     assert bool(found) == bool(told)
 
@@ -260,7 +261,7 @@ def test_what_explains_a_refusal_comes_before_it(found, another, refused, remark
         'stretched': found.get('board', ''),
         '_lens': (found.get('lens', ''), 'imitated' in found),
         '_sigmas': found.get('sigmas', ''),
-        '_scale': [Reason(Rule.SCALE, found['scale'])] if 'scale' in found else [],
+        'scale_reasons': [Reason(Rule.SCALE, found['scale'])] if 'scale' in found else [],
         '_sessions': found.get('sessions', ''),
         '_another_type': found.get('type', ''),
         '_level_hand': found.get('level', ''),
