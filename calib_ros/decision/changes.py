@@ -10,8 +10,8 @@ x ~ N(0, K), such as the uncertainty of an earlier calibration, are marginalised
 
 An explanation is x = G z: one parameter, all of a joint, with theta and d of the next or not (a
 bent link; in the modified convention of the one before), all of a frame (a moved device or
-target), a shift of a frame, or the scale of the device has changed. It reduces chi-squared, with
-as many degrees of freedom as z, by
+target), a shift of a frame, or the scale of device or arm changed. It reduces chi-squared, with as
+many degrees of freedom as z, by
 
     (G^T b')^T (G^T A' G)^-1 (G^T b')
 
@@ -51,17 +51,14 @@ from calib_ros.shown import Shown, rounded
 
 FALSE_ALARM = 0.5 * (1.0 - CERTAIN)
 """False alarms of an unchanged arm: one side of CERTAIN (benchmarks/recalibration.py)."""
-LIKELY = float(special.ndtri(0.5 + 0.5 * CONFIDENT))
-"""Half of a 95 % interval in standard deviations."""
+LIKELY = float(special.ndtri(0.5 + 0.5 * CONFIDENT))  # half of a 95 % interval in sigmas
 SIZES = {'m': 1e-3, 'rad': 2e-3}
 """Typical size [m, rad] of changes by a collision or a replaced motor; a factor of three either
 way costs half a unit of log evidence."""
-SCALE_OF_DEVICE = Parameter('device', 'ratio')
-"""Scale of all measured lengths: of the arm, and of the distance to it."""
-LOAD = 'load'
-"""Owner of what the arm bends under a load at its end."""
-OUTSIDE = (SCALE_OF_DEVICE.owner, LOAD)
-"""Owners of changes that are none of the arm."""
+SCALES = (Parameter('device', 'ratio'), Parameter('arm itself', 'ratio'))
+"""Of all measured lengths, those to the arm included, and of the arm alone, which is warmer."""
+LOAD = 'load'  # owner of what the arm bends under a load at its end
+OUTSIDE = (*(name.owner for name in SCALES), LOAD)  # owners of changes that come and go
 ORDER = ('theta', 'd', 'a', 'b', 'alpha', 'beta')
 """Order in which a joint's parameters are named if two have the same effect."""
 
@@ -94,19 +91,18 @@ class Explanation(Shown):
             parts = groupby(self.names, lambda name: self.owner if every else name.owner)
             kinds = ((each, dict.fromkeys(name.kind for name in own)) for each, own in parts)
             return ' with '.join(f'{each} ({", ".join(own)})' for each, own in kinds)
-        what = 'the scale of the device' if self.names == (SCALE_OF_DEVICE,) else self.names[0]
+        what = f'the scale of the {self.owner}' if self.names[0] in SCALES else self.names[0]
         return f'{what} by {self.size_in_words()}'
 
     def size_in_words(self) -> str:
         """Return the size of the change of a single parameter."""
-        (change,), (sigma,) = self.change.tolist(), self.sigma.tolist()
-        if self.names == (SCALE_OF_DEVICE,):
-            return f'{1e6 * change:+.0f} ± {1e6 * LIKELY * sigma:.0f} ppm (95 %)'
-        return with_limits(self.names[0], change, sigma)
+        return with_limits(self.names[0], *self.change.tolist(), *self.sigma.tolist())
 
 
 def with_limits(name: Parameter, change: float, sigma: float) -> str:
     """Return a change of a parameter in words, with its 95 % interval."""
+    if name in SCALES:
+        return f'{1e6 * change:+.0f} ± {1e6 * LIKELY * sigma:.0f} ppm (95 %)'
     factor, unit = name.small_unit
     return f'{rounded(factor * change, "+")} ± {rounded(factor * LIKELY * sigma)} {unit} (95 %)'
 
@@ -157,8 +153,7 @@ class Information(Shown):
     def mean(self, root: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return posterior mean (P,) and covariance (P, P) with the prior N(0, root root^T)."""
         values, axes = np.linalg.eigh(np.eye(root.shape[1]) + root.T @ self.matrix @ root)
-        # less than one only by rounding, of poses far away
-        left = (root @ (axes / np.sqrt(np.maximum(values, 1.0)))).T
+        left = (root @ (axes / np.sqrt(np.maximum(values, 1.0)))).T  # below 1 by rounding, far off
         return left.T @ (left @ self.vector), left.T @ left
 
     def evidence(self, root: FloatArray) -> float:
@@ -187,8 +182,8 @@ def reasons_of(
 ) -> tuple[Explanation, ...]:
     """Return the best explanation of a change, and those indistinguishable from it.
 
-    None if all are by chance with a probability above `most`. `freedom` are the degrees of freedom
-    of the noise estimate.
+    None if all are by chance with a probability above `most`, or no likelier than no change (if
+    `most` is below 1). `freedom` are the degrees of freedom of the noise estimate.
     """
     if not columns.sets:
         return ()
@@ -202,7 +197,9 @@ def reasons_of(
         _explanation(information, columns, freedom, *each, share)
         for each, share in zip(columns.sets, special.softmax(logs).tolist(), strict=True)
     ]
-    if min(each.chance for each in found) > most:
+    doubted = most < 1.0 and max(logs) <= 0.0
+    # smooth errors of a device look like a warmer arm, which explains but does not claim
+    if doubted or min(e.chance for e in found if e.names != SCALES[1:]) > most:
         return ()
     found.sort(key=lambda each: -each.share)
     return tuple(each for each in found if each.share > 1.0 - CONFIDENT) or (found[0],)
@@ -266,7 +263,7 @@ class ChangeColumns:
 
     Changes of others show in these if they are gauge freedoms beside them, otherwise not at all.
     `frames` may have moved; others are free and absorb what they can. `scaled` allows another
-    scale of the device, with linear joints only if their travel is among the names.
+    scale of device and arm, with linear joints only if their travel is among the names.
     """
 
     def __init__(
@@ -302,10 +299,13 @@ class ChangeColumns:
             sets.append((LOAD, carried))
         grows = {name: chain.value(name) for name in self._columns if name.is_length}
         grows |= dict.fromkeys(travels(chain), 1.0)
-        if scaled and grows and grows.keys() <= self._columns.keys():
-            grown = [size * self._columns[name] for name, size in grows.items()]
-            self._columns[SCALE_OF_DEVICE] = np.sum(grown, axis=0)
-            sets.append((SCALE_OF_DEVICE.owner, (SCALE_OF_DEVICE,)))
+        of_arm = {name: size for name, size in grows.items() if not chain.owns_frame(name)}
+        if scaled and of_arm and grows.keys() <= self._columns.keys():
+            there = any(frame.startswith('base') for frame in frames)  # else both look alike
+            for scale, lengths in list(zip(SCALES, (grows, of_arm), strict=True))[: 1 + there]:
+                grown = [size * self._columns[name] for name, size in lengths.items()]
+                self._columns[scale] = np.sum(grown, axis=0)
+                sets.append((scale.owner, (scale,)))
         self.sets = tuple(sets)
         self.zeros = tuple(j.driven for j in chain.joints if j.driven in self._columns)
 
@@ -320,9 +320,9 @@ class ChangeColumns:
         return tuple(units)
 
     def unscaled(self) -> ChangeColumns:
-        """Return the effects without another scale of the device."""
+        """Return the effects without another scale."""
         found = copy.copy(self)
-        found.sets = tuple(each for each in self.sets if each[1] != (SCALE_OF_DEVICE,))
+        found.sets = tuple(each for each in self.sets if each[1][0] not in SCALES)
         return found
 
     def of(self, names: Sequence[Parameter]) -> FloatArray:
@@ -331,7 +331,7 @@ class ChangeColumns:
 
     def root(self, times: Mapping[Parameter, float]) -> FloatArray:
         """Return a root (P, k) of the covariance of changes so many typical ones large."""
-        known = SIZES | {SCALE_OF_DEVICE.unit: SCALE}
+        known = SIZES | {SCALES[0].unit: SCALE}
         sizes = [(known.get(n.unit) or expected(n)) * each for n, each in times.items()]
         return self.of([*times]) * sizes
 

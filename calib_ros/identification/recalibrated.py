@@ -168,6 +168,9 @@ class Recalibration(Shown):
             if not self.out_of_scale:
                 why = 'the arm bends as under another load than in the earlier calibration'
                 return why, f'measure with that load, or, with this one, {ANEW}'
+            if cause.owner != changes.OUTSIDE[0]:
+                why = f'all lengths of the arm changed alike, by {cause.size_in_words()}'
+                return why, f'measure it as warm as it was, or, as warm as now, {ANEW}'
             return (
                 f'the scale of the measuring device changed, by {cause.size_in_words()}',
                 'check it with a known length, and the temperature and pressure set in it; or the '

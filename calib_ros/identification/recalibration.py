@@ -25,7 +25,7 @@ import numpy as np
 from calib_ros.annotated import NotNegative, as_annotated
 from calib_ros.decision import changes, mistakes
 from calib_ros.decision.another import is_another
-from calib_ros.decision.changes import SCALE_OF_DEVICE, ChangeColumns, Explanation, Information
+from calib_ros.decision.changes import SCALES, ChangeColumns, Explanation, Information
 from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.decision.cross_validation import fold_residuals
 from calib_ros.decision.residuals import residuals
@@ -277,7 +277,7 @@ class _Arm:
         """Return what has changed, each with its likely explanations."""
         found: list[tuple[Explanation, ...]] = []
         while reasons := self.widened(columns, found).reasons(information, columns):
-            if reasons[0].names == (SCALE_OF_DEVICE,) and abs(reasons[0].change[0]) < SCALE:
+            if reasons[0].names[0] in SCALES and abs(reasons[0].change[0]) < SCALE:
                 columns = columns.unscaled()  # as much is usual
             elif len(found) < SEVERAL:
                 found.append(reasons)
@@ -290,7 +290,7 @@ class _Arm:
         """Return what has changed; of possible device errors only another scale."""
         freedom = self.previous.freedom
         found = changes.reasons_of(information.marginalised(self.square), columns, freedom)
-        if found and found[0].names == (SCALE_OF_DEVICE,):
+        if found and found[0].names == SCALES[:1]:
             return found
         return changes.reasons_of(information.marginalised(self.doubted), columns, freedom)
 

@@ -13,7 +13,7 @@ from scipy import optimize
 from calib_ros import load_chain
 from calib_ros.decision import changes
 from calib_ros.decision.changes import (
-    SCALE_OF_DEVICE,
+    SCALES,
     ChangeColumns,
     Explanation,
     Information,
@@ -122,7 +122,7 @@ def test_a_change_is_as_large_as_its_evidence_tells(kind, size, times):
 @pytest.mark.parametrize(
     ('owner', 'names', 'told'),
     [
-        ('device', [changes.SCALE_OF_DEVICE], 'the scale of the device by +100 ± 20 ppm (95 %)'),
+        ('device', [SCALES[0]], 'the scale of the device by +100 ± 20 ppm (95 %)'),
         ('elbow', [Parameter('elbow.theta')], 'elbow.theta by +0.100 ± 0.020 mrad (95 %)'),
         ('elbow', [Parameter('elbow.a')], 'elbow.a by +0.100 ± 0.020 mm (95 %)'),
         ('elbow', [Parameter('elbow.a'), Parameter('elbow.d')], 'elbow (a, d)'),
@@ -184,8 +184,8 @@ def test_of_parameters_with_one_effect_the_first_is_named_and_only_then():
 def test_the_scale_of_the_device_is_that_of_all_lengths():
     names = [*THREE, Parameter('elbow_joint.a'), Parameter('wrist_1_joint.d')]
     found = ChangeColumns(UR10E, names, scaled=True)
-    assert found.sets[-1] == ('device', (changes.SCALE_OF_DEVICE,))
-    (grown,) = found.of((changes.SCALE_OF_DEVICE,)).T
+    assert found.sets[-1] == ('device', SCALES[:1])
+    (grown,) = found.of(SCALES[:1]).T
     np.testing.assert_allclose(grown[3:], [UR10E.joints[2].a, UR10E.joints[3].d], rtol=1e-3)
     assert found.unscaled().sets == found.sets[:-1] == ChangeColumns(UR10E, names).sets
     assert not any(owner == 'device' for owner, _ in ChangeColumns(UR10E, THREE, scaled=True).sets)
@@ -224,6 +224,16 @@ def test_the_chance_of_an_explanation_is_that_of_all_that_are_tried(size, rng):
     assert best.chance == min(1.0, len(columns.sets) * chance_of(gain, rank, 50.0))
     assert (best.gain, best.change.tolist()) == (gain, change.tolist())
     assert best.sigma.tolist() == np.sqrt(np.diag(covariance)).tolist()
+
+
+def test_a_change_far_beyond_any_usual_one_is_none(rng):
+    """Of one SCARA of sixteen a load was named that bends it by a thousand times the usual."""
+    information, columns = known(rng, np.array([0.0, 3.5e-5, 0.0])), ChangeColumns(UR10E, THREE)
+    columns.sets = tuple(('elbow_joint', (name,)) for name in THREE)
+    assert reasons_of(information, columns, 50.0, most=0.999)
+    far = Information(THREE, 1e-12 * information.matrix, 1e-6 * information.vector)
+    assert reasons_of(far, columns, 50.0, most=1.0)
+    assert not reasons_of(far, columns, 50.0, most=0.999)
 
 
 def test_what_is_outside_the_arm_is_tried_as_often_as_the_joint_that_is_tried_most(rng):
@@ -283,7 +293,7 @@ def test_the_square_of_a_change_is_that_of_positions_in_the_best_frames():
 
 def test_a_scale_is_told_in_ppm():
     ppm = np.array([2.5e-4])
-    told = Explanation('device', (SCALE_OF_DEVICE,), 9.0, 0.0, 1.0, ppm, 0.1 * ppm)
+    told = Explanation('device', SCALES[:1], 9.0, 0.0, 1.0, ppm, 0.1 * ppm)
     assert told.in_words() == 'the scale of the device by +250 ± 49 ppm (95 %)'
 
 

@@ -6,10 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import UR10E, problem
+from fits import UR10E, arm, problem
 
-from calib_ros import Calibration, identify, recalibrate
-from calib_ros.decision.changes import FALSE_ALARM, LOAD, SCALE_OF_DEVICE
+from calib_ros import Calibration, identify, load_chain, recalibrate
+from calib_ros.decision.changes import FALSE_ALARM, LOAD, OUTSIDE
+from calib_ros.estimation.considered import travels
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.settings import Settings
 
@@ -43,7 +44,8 @@ def result(before=0.1, after=0.1, owners=(), **change):
         ({'owners': ['elbow_joint'], 'before': 0.2}, True),
         ({'owners': ['elbow_joint']}, False),  # which changed nothing
         ({'owners': [LOAD], 'before': 0.2}, False),
-        ({'owners': ['elbow_joint', SCALE_OF_DEVICE.owner], 'before': 0.2}, False),
+        ({'owners': ['elbow_joint', OUTSIDE[0]], 'before': 0.2}, False),
+        ({'owners': [OUTSIDE[1]], 'before': 0.2}, False),
         ({'known_after': 1.49e-4}, True),
         ({'known_after': 1.51e-4}, False),
         ({'known_after': 1.51e-4, 'moved': 1e-3}, True),
@@ -66,6 +68,24 @@ def test_an_arm_is_known_less_the_longer_it_was_not_measured():
     years = [0.0, 1.0, 10.0]
     known = [recalibrate(previous, problem(UR10E, 8, 1), each).known_before for each in years]
     assert (np.diff(known) > 0.0).all()
+
+
+@pytest.mark.parametrize('chain', [UR10E, load_chain('ur10e_on_linear_axis')])
+def test_a_warm_arm_at_the_same_base_is_told(chain):
+    """A joint was named, or the mean of both temperatures was accepted."""
+    true = arm(4, chain=chain)
+    previous = Calibration.of(identify(problem(true, 60, 0, chain=chain)))
+    names = [name for joint in chain.joints for name in joint.parameters if name.is_length]
+    warm = {name: 2.5e-4 * true.value(name) for name in names}
+    warm |= dict.fromkeys(travels(chain), 2.5e-4)
+    found = recalibrate(
+        previous,
+        problem(true.with_effects(travels(chain)).with_offsets(warm), 30, 1, chain=chain),
+        0.1,
+    )
+    assert 1e6 * found.outside.change[0] == pytest.approx(250.0, abs=60.0)
+    assert found.refusal()[0].startswith('all lengths of the arm changed alike, by')
+    assert recalibrate(previous, problem(true, 30, 1, chain=chain), 0.1).accepted
 
 
 def test_a_document_is_in_millimetres():
