@@ -21,7 +21,8 @@ def outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
     region = compensator.region
     if region is None:
         return []
-    far = np.flatnonzero(~region.covers(result.command))
+    never = beyond(result.command, compensator.nominal).any(axis=1)  # told by `unreached`
+    far = np.flatnonzero(~(region.covers(result.command) | never))
     share = 100.0 * len(far) / len(result.command)
     where = f'the calibration is not valid in {share:.0f} % of the program, as here'
     found, joints = [], result.command[far]
