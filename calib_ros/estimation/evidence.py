@@ -86,7 +86,7 @@ class Inference:
         """
         waves, fitted = posterior.unmodelled.waves, self.fitted
         noisy = self.least > HALF_THE_DIGITS  # as all that is measured
-        strained = self.strained or (noisy and bool(travels(fitted.chain)))
+        strained = noisy and (self.strained or bool(travels(fitted.chain)))
         again = replace(self, noise=self.least) if strained else self
         columns = _Columns(again, waves, strained) if waves or strained else self._without_waves
         (evidence, size, wider, near), arm = columns.plausible, columns.arm
