@@ -29,45 +29,52 @@ def scale_reasons(problem: Problem, result: Identification) -> Iterator[Reason]:
         return
     certain = problem.sigma_scale and found.rival and special.expit(found.rival[0]) > CERTAIN
     if region.by_scale >= HARMFUL or certain:
-        text = out_of_scale(found.scale, False, bool(problem.sigma_scale), found.strain)
+        text = out_of_scale(found.scale, strain=found.strain)
+        if problem.sigma_scale:
+            again = 'measure a known length, or the printed board, again'
+            text = f'{_grown(found.scale, found.strain)}, more than sigma_scale allows: {again}'
         yield Reason(Rule.SCALE, result.strain or text)
 
 
 def out_of_scale(
-    scale: float, printed: bool = False, checked: bool = False, strain: float = 0.0
+    scale: float, printed: bool = False, stated: float = 0.0, strain: float = 0.0
 ) -> str:
     """Return that a scale of the device, given minus one, may make the calibrated arm worse.
 
-    Of a `printed` board it is that of its stated size. Linear joints imitate a `strain`, by which
-    it differs with the direction.
+    Of a `printed` board it is that of its stated size. It may be `stated` to be known to that.
+    Linear joints imitate a `strain`, by which it differs with the direction.
     """
-    way, size = ('grow', 'large') if scale > 0.0 else ('shrink', 'small')
-    grown = f'all lengths of the arm {way} alike, by {percent(abs(scale))} %'
-    if strain > abs(scale):
-        grown = f'lengths come out {percent(strain)} % longer in one direction than in another'
-    if checked:
-        return (
-            f'{grown}, more than sigma_scale allows: measure a known length, or the printed '
-            'board, again'
-        )
-    if strain > abs(scale):
-        return (
-            f'{grown}, by the linear joints or by the measuring device; if by the device, the '
-            'correction may make the arm worse. Check its scale along each linear joint with a '
-            'known length: if it is right, set sigma_scale (--sigma-scale) to its accuracy, and '
-            'fit the scale of the joints (model auto)'
-        )
+    grown, size = _grown(scale, strain), 'large' if scale > 0.0 else 'small'
     text = f'{grown}, as if the measuring device were out of scale; then'
     check, what, usual = 'If a known length shows that its', 'scale of the device', SCALE
     if printed:
         check, what, usual = 'Measure the print; if its', 'size of the board', LARGEST_SCALE
         text = f'{grown}, as if the board were stated too {size}; then'
-    if abs(scale) < usual:  # as devices have, or arms
+    if abs(scale) < usual or stated:  # as devices have, or arms
         text = f'the {what} is not known well enough:'
-    return (
-        f'{text} the correction may make the arm worse. {check} scale is right, set sigma_scale '
-        '(--sigma-scale) to its accuracy'
-    )
+    if strain > abs(scale):
+        text = f'{grown}, by the linear joints or by the measuring device; if by the device,'
+    harm = f'{text} the correction may make the arm worse'
+    if stated:
+        return (
+            f'{harm}, at sigma_scale {percent(stated)} %: measure poses all over the workspace, '
+            'or the scale more accurately'
+        )
+    if strain > abs(scale):
+        return (
+            f'{harm}. Check its scale along each linear joint with a known length: if it is '
+            'right, set sigma_scale (--sigma-scale) to its accuracy, and fit the scale of the '
+            'joints (model auto)'
+        )
+    return f'{harm}. {check} scale is right, set sigma_scale (--sigma-scale) to its accuracy'
+
+
+def _grown(scale: float, strain: float) -> str:
+    """Return by how much lengths are off, in one direction more than in another or alike."""
+    if strain > abs(scale):
+        return f'lengths come out {percent(strain)} % longer in one direction than in another'
+    way = 'grow' if scale > 0.0 else 'shrink'
+    return f'all lengths of the arm {way} alike, by {percent(abs(scale))} %'
 
 
 def percent(share: float) -> str:

@@ -140,6 +140,7 @@ def test_a_board_by_which_hardly_an_arm_grows_is_not_said_to_be_of_another_size(
     assert out_of_scale(6e-6).startswith('the scale of the device is not known well enough: the')
     assert 'grow alike, by 0.011 %, as if the measuring device' in out_of_scale(1.1e-4)
     assert 'shrink alike, by 0.11 %, as if' in out_of_scale(-1.1e-3, printed=True)
+    assert 'at sigma_scale 0.01 %: measure poses all' in out_of_scale(1.1e-3, stated=1e-4)
 
 
 @pytest.mark.parametrize('on_flange', [True, False])
