@@ -360,7 +360,7 @@ def _numbers(text: str, decimal: str = '.') -> FloatArray:
 def cell_number(text: str, decimal: str = '.') -> float:
     """Return the number in a cell (1.5D-3 as Fortran writes), NaN if blank, else infinity."""
     low = text.strip().lower().replace('\u2212', '-')  # the minus of typesetting
-    low = low.replace(decimal, '.')
+    low = low.replace(decimal, '.').replace('_', '?')  # 1_0 is 10 to Python only
     with suppress(ValueError):
         return math.nan if low in MISSING else float(low.replace('d', 'e'))
     return math.inf

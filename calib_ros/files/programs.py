@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +22,27 @@ import numpy as np
 
 from calib_ros.apply.program import Program, joint_values
 from calib_ros.errors import InputError
-from calib_ros.files.columns import Columns, check_quaternions, columns_of, require_rows
+from calib_ros.files.columns import (
+    Columns,
+    cell_number,
+    check_quaternions,
+    columns_of,
+    require_rows,
+)
 from calib_ros.files.headers import name_and_unit, places
 from calib_ros.files.sheets import decimal_sign, refuse_short, text_and_separator
-from calib_ros.files.vocabulary import ANGLES, LENGTHS, POSE_COLUMNS, joint_columns
+from calib_ros.files.vocabulary import ANGLES, LENGTHS, POSE_COLUMNS, POSITION, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.limits import check_limits, check_turns
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
-from calib_ros.values import parse_numbers
+from calib_ros.values import parse_number, parse_numbers
 
 TRAJECTORIES = ('.yaml', '.yml')
 RATES = ('positions', 'velocities', 'accelerations')
 """Fields of a JointTrajectory point that a correction changes."""
+TIME = 'time_from_start'
 
 
 def read_joints(path: Path, chain: Chain) -> FloatArray:
@@ -77,8 +86,12 @@ def _program(found: Columns, chain: Chain) -> tuple[Columns, tuple[str, ...], Fl
     def needed(names: Sequence[str]) -> list[str]:
         return [name for k, name in enumerate(names) if k not in chain.held]
 
-    ways = (names, [*joints], [name.upper() for name in names])
-    names = next((each for each in ways if {*needed(each)} <= {*header}), names)
+    all_ways = (names, [*joints], [name.upper() for name in names])
+    ways = {tuple(each): each for each in all_ways if {*needed(each)} <= {*header}}
+    names = next(iter(ways.values()), names)
+    if len(ways) > 1 and not {*map(str.lower, joints)} & {*POSITION}:  # of a gantry, measured
+        both = ' and in '.join(f'{first} ...' for first, *_ in ways)
+        raise InputError(f'{found.path} has joint values in {both}: leave out all but one')
     columns = [_column(found, name) for name in names]
     kinds = (ANGLES if joint.type == 'revolute' else LENGTHS for joint in chain.joints)
     units = _units(found, dict(zip(columns, kinds, strict=True)))
@@ -184,6 +197,11 @@ def read_program(path: Path, chain: Chain) -> ProgramFile:
 def _read_csv(path: Path, chain: Chain) -> ProgramFile:
     table, separator, text, coding = _columns(path)
     found, names, units, program = _program(table, chain)
+    places = tuple(f'line {n}' for n in found.lines)
+    if (time := _column(found, TIME)) in found.header:
+        sign = decimal_sign(found.texts(time))
+        times = [cell_number(cell, sign) for cell in found.texts(time)]
+        _refuse_falling(times, places, str(path))
     small = joint_columns(len(names), 's')
     signs = [each if each in found.header else each.upper() for each in small]  # beside Q1 ... Qn
     known = [k for k, sign in enumerate(signs) if sign in found.header]
@@ -203,7 +221,17 @@ def _read_csv(path: Path, chain: Chain) -> ProgramFile:
                 row[k] = repr(value).replace('.', found.decimal)
         return csv_text([header, *rows], separator, '\r\n' if '\r\n' in text else '\n')
 
-    return ProgramFile(program, tuple(f'line {n}' for n in found.lines), text_with, coding)
+    return ProgramFile(program, places, text_with, coding)
+
+
+def _refuse_falling(times: Sequence[float], places: Sequence[str], where: str) -> None:
+    """Refuse samples that are not in the order of their times (N); NaN and infinity are none."""
+    for (before, after), place in zip(pairwise(times), places[1:], strict=True):
+        if after < before < math.inf:
+            raise InputError(
+                f'{where}, {place}: {TIME} falls from {before:g} to {after:g}: put the samples '
+                'into the order of their times'
+            )
 
 
 def _read_yaml(text: str, where: str) -> ProgramFile:
@@ -232,7 +260,20 @@ def _read_yaml(text: str, where: str) -> ProgramFile:
         return dump_yaml(message | {'points': new})
 
     places = tuple(f'point {k + 1}' for k in range(len(points)))
+    times = [
+        _seconds(point.get(TIME, {}), f'{where}, {place}')
+        for place, point in zip(places, points, strict=True)
+    ]
+    _refuse_falling(times, places, where)
     return ProgramFile(trajectory_program(names, points, where), places, text_with)
+
+
+def _seconds(time: object, where: str) -> float:
+    """Return the seconds of a Duration as printed, 0 by default as in a message."""
+    parts = time if isinstance(time, Mapping) else {'sec': time}
+    given = [parts.get(key, 0) for key in ('sec', 'nanosec')]
+    sec, nanosec = (parse_number(x, f'{where}: {TIME}', InputError, 2.0**32) for x in given)
+    return sec + 1e-9 * nanosec
 
 
 def trajectory_program(

@@ -372,3 +372,26 @@ def test_files_that_are_no_programs_are_refused(run, tmp_path, suffix, text, com
     assert err.startswith('calib_ros: ')
     assert re.search(complaint, err)
     assert not (tmp_path / f'out{suffix}').exists()
+
+
+def test_of_two_columns_of_a_joint_none_is_preferred(tmp_path):
+    """Silently those of q1 ... were corrected."""
+    path, arm = tmp_path / 'program.csv', Chain('arm', 'standard', (Joint('a'), Joint('b')))
+    path.write_text('q1,q2,a,b\n1,2,3,4\n')
+    with pytest.raises(InputError, match=r'joint values in q1 \.\.\. and in a \.\.\.: leave out'):
+        read_joints(path, arm)
+    path.write_text('q1,x,y\n1,2,3\n')  # measured
+    assert read_joints(path, Chain('x', 'standard', (Joint('x', 'prismatic'),))) == 1
+
+
+def test_a_program_that_goes_back_in_time_is_refused(tmp_path):
+    path, arm = tmp_path / 'program.csv', Chain('arm', 'standard', (Joint('a'),))
+    path.write_text('q1;time_from_start [s]\n1;0,5\n1;0,5\n2;10\n')
+    read_program(path, arm)
+    path.write_text(path.read_text().replace(';10', ';0,4'))
+    with pytest.raises(InputError, match=r'line 4: time_from_start falls from 0.5 to 0.4: put'):
+        read_program(path, arm)
+    path = tmp_path / 'program.yaml'
+    path.write_text(trajectory(np.zeros((3, 1)), 'a').replace('sec: 1', 'sec: 3'))
+    with pytest.raises(InputError, match='point 3: time_from_start falls from 3 to 2: put'):
+        read_program(path, arm)

@@ -166,7 +166,7 @@ FAULTS = [
     ),
     (f'q1,q2,x,y,z,frame_id\n{NAMED}', r'map \(lines 3, 4, 5, 6, 7, and 3 more\)'),
     *((POINTS.replace('5.5', f'"{each}"'), f"y must be a finite number, not '{each}': correct")
-      for each in ('nan', 'inf', '-inf', ' ', 'twelve', '1;2')),
+      for each in ('nan', 'inf', '-inf', ' ', 'twelve', '1;2', '1_0')),
     (POINTS.replace('5.5', '""'), 'y must be a finite number, not empty or NaN: correct'),
     (POINTS.replace('5.5', '5.5 mm'), r'y must be .*: write its unit into the header, y \[mm\]'),
     (POINTS.replace('5.5', '"0,5"'), "line 3: y must be .*, not '0,5': write a point"),
@@ -358,7 +358,7 @@ def test_a_column_of_any_length_is_read_to_the_last_bit(tmp_path):
     cells = [
         f'{x!r}{"0" * 90}' for x in np.random.default_rng(0).uniform(0.1, 2.0, 12_000).tolist()
     ]
-    cells[5000], cells[-3:] = '', ['1_0', ' 2 ', '']
+    cells[5000], cells[-3:] = '', ['+1E1', ' 2 ', '']
     path.write_text('\n'.join(['q1,x', *(f'{cell},1' for cell in cells), '']))
     found = read_columns(path, ['q1']).numbers(['q1', 'x'])
     np.testing.assert_array_equal(found[:, 0], [float(cell or 'nan') for cell in cells])
