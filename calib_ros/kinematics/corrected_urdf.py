@@ -4,16 +4,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib_ros.annotated import as_annotated
 from calib_ros.errors import ConfigError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.axes import link_ends
-from calib_ros.kinematics.chain import Chain, refuse_other_joints
+from calib_ros.kinematics.chain import Chain, Frame, refuse_other_joints
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import chain_from_urdf, coupling_of
 from calib_ros.kinematics.urdf_editor import edited
@@ -44,7 +46,8 @@ def corrected_urdf(
     which a URDF cannot represent.
     """
     nominal = chain_from_urdf(text, base_link, tip_link, chain.convention)
-    arm = replace(chain, base=nominal.base, tool=nominal.tool, frames=())
+    refuse_other_joints('the chain', chain, 'the URDF, between these links,', nominal)
+    arm = min(_in_frames_of(nominal, chain), key=lambda each: sum(_apart(each, nominal)))
     _refuse_others(arm, nominal)
     robot = parse_urdf(text)
     path = robot.path(base_link, tip_link)
@@ -98,24 +101,44 @@ def _multipliers(
     return found
 
 
+def _in_frames_of(nominal: Chain, chain: Chain) -> Iterator[Chain]:
+    """Yield an arm with base and tool of a nominal one by first and last frames as tables may be.
+
+    There z is against the axis of a joint of sign -1, and x in any of four directions.
+    """
+    turns = Rotation.from_rotvec([[0.0, 0.0, k * np.pi / 2.0] for k in range(4)]).as_matrix()
+    ways = [turns * [1.0, joint.sign, joint.sign] for joint in (chain.joints[0], chain.joints[-1])]
+    for first, last in product(*(se3.transform(each, np.zeros((4, 3))) for each in ways)):
+        base, tool = (
+            nominal.frame('base').matrix @ first,
+            se3.invert(last) @ nominal.frame('tool').matrix,
+        )
+        yield replace(chain, base=Frame(base), tool=Frame(tool), frames=())
+
+
 def _refuse_others(arm: Chain, nominal: Chain) -> None:
-    refuse_other_joints('the chain', arm, 'the URDF, between these links,', nominal)
     known = dict(nominal.effects)
     if effects := [name for name, value in arm.effects if value and name not in known]:
         raise ConfigError(
             f'a URDF cannot represent the effects {", ".join(effects)}, and the chain is not '
             'accurate without them: identify with the model "geometric"'
         )
-    q = nominal.random_joints(50, np.random.default_rng(0))
-    found, expected = arm.forward(q), nominal.forward(q)
-    shift = np.linalg.norm(found[:, :3, 3] - expected[:, :3, 3], axis=1).mean()
-    turns = found[:, :3, :3] @ np.swapaxes(expected[:, :3, :3], 1, 2)
-    turn = np.linalg.norm(se3.log_rotation(turns), axis=1).mean()
+    shift, turn = _apart(arm, nominal)
     if max(shift, turn) > MOST_APART:
         raise ConfigError(
             f'the chain is not the arm of this URDF between these links: the poses differ by '
             f'{shift:.3g} m and {turn:.3g} rad on average; identify again with the URDF as chain'
         )
+
+
+def _apart(arm: Chain, nominal: Chain) -> tuple[float, float]:
+    """Return the mean distance [m] and angle [rad] between the poses of two arms."""
+    q = nominal.random_joints(50, np.random.default_rng(0))
+    found, expected = arm.forward(q), nominal.forward(q)
+    shift = np.linalg.norm(found[:, :3, 3] - expected[:, :3, 3], axis=1).mean()
+    turns = found[:, :3, :3] @ np.swapaxes(expected[:, :3, :3], 1, 2)
+    turn = np.linalg.norm(se3.log_rotation(turns), axis=1).mean()
+    return float(shift), float(turn)
 
 
 def _on_axes(chain: Chain) -> FloatArray:

@@ -152,3 +152,17 @@ def test_the_last_row_needs_a_fixed_joint_behind(kind, rng):
     chain = nominal.with_offsets({f'wrist_3_joint.{kind}': 1e-3})
     found = poses_of(corrected_urdf(UR10E, chain), chain, q)
     np.testing.assert_allclose(found, chain.forward(q), rtol=0.0, atol=EXACT)
+
+
+@pytest.mark.parametrize('turn', [0.0, np.pi])
+@pytest.mark.parametrize('sign', [1, -1])
+def test_the_ends_of_a_table_may_be_turned(sign, turn, rng):
+    """As those of the Fanuc, ABB and Mecademic supplied: by 3.14 rad they were another arm."""
+    chain = load_chain('ur10e').with_offsets({'elbow_joint.theta': 1e-2, 'wrist_2_joint.d': 1e-3})
+    *rows, fifth, last = chain.joints
+    fifth = replace(fifth, alpha=fifth.alpha + np.pi * (sign < 0))
+    last = replace(last, sign=sign, theta=sign * last.theta + turn, d=sign * last.d)
+    table = replace(chain, joints=(*rows, fifth, last))
+    q = chain.random_joints(10, rng)
+    found, wanted = (chain_from_urdf(corrected_urdf(UR10E, each)) for each in (table, chain))
+    np.testing.assert_allclose(found.forward(q), wanted.forward(q), rtol=0.0, atol=EXACT)
