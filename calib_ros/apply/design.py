@@ -60,6 +60,8 @@ class Design(Shown):
         seen = problem.observations
         if seen.distances is not None or problem.separations:
             raise InputError('planning needs measured poses or positions, not distances')
+        if len(problem.chain.held) == len(problem.chain.joints):
+            raise InputError('no joint can move: the limits of each are equal')
         model = problem.model
         priors = problem.prior_sigmas
         structural = structurally_independent(model, problem.free, problem.sets)

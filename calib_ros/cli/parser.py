@@ -41,6 +41,9 @@ def unknown_word(word: str, parser: argparse.ArgumentParser) -> str:
     option = word.partition('=')[0]
     known = (each for action in parser._actions for each in action.option_strings)
     hint = near(option, known, 0.7)
+    bare = {action.metavar for action in parser._actions if not action.option_strings}
+    if option == '--calibration' and (first := bare & {'RESULT', 'CALIBRATION'}):
+        hint = f'give {first.pop()} first, without an option'
     if option in READING:
         hint = 'name columns and units in the first line of the file: q1 [deg]'
     return f'unknown option "{option}"' + (f': {hint}' if hint else '')

@@ -163,3 +163,11 @@ def test_heights_of_a_new_device_and_target_of_a_level_hand_are_not_asked_for(se
     new = {'base': random_frame(rng, 2.0), 'tool': random_frame(rng, 0.2)}
     found = recalibrate(previous, seen(replace(true, **new), 12), 0.1, new=(*new,))
     assert (found.accepted, found.changed) == (True, ())
+
+
+def test_without_a_joint_that_moves_nothing_is_planned(run, tmp_path):
+    """It asked for more candidates apart from each other."""
+    joints = tuple(replace(joint, lower=0.1, upper=0.1) for joint in IIWA.joints)
+    (tmp_path / 'still.yaml').write_text(dump_chain(replace(IIWA, joints=joints)))
+    status, _, told = run('plan', '--chain', 'still.yaml')
+    assert (status, 'no joint can move: the limits of each are equal' in told) == (1, True)

@@ -130,6 +130,7 @@ def test_the_help_of_a_command(shown, name):
         (('plan', '--chain', 'ur5e', '--pose', '9', '--otu', 'x'), 'option "--otu": did you mean'),
         (('identify', 'x.csv', '--chian', 'ur5e'), 'option "--chian": did you mean "--chain"?'),
         (('bag2csv', 'bag', 't.csv', '--chain', 'ur5e', '--xyz=3'), 'unknown option "--xyz"\n'),
+        (('workspace', *UR5E, '--calibration=c'), '"--calibration": give RESULT first, without'),
         (('robots', 'ur5e'), 'unexpected argument "ur5e"\n'),
         (('identify', 'a.csv', 'b.csv', *UR5E), 'make one table, with a column session (or'),
         (('chain',), 'required: ROBOT'),
