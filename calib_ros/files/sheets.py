@@ -114,7 +114,7 @@ def read_sheet(
 
 def _of_text(path: Path, layout: Layout) -> _Content:
     text, coding = text_and_encoding(path)
-    told = f'the text is read as {coding}, because it is not UTF-8'
+    told = f'the text, not UTF-8, is read as {coding}: if its words are wrong, save it as UTF-8'
     notes = [told] if not coding.startswith('utf') else []
     if '\r' in text:
         text = text.replace('\r\n', '\n').replace('\r', '\n')

@@ -267,7 +267,7 @@ def test_columns_that_someone_may_have_wanted_are_told(tmp_path, text, said):
         ('shoulder,Elbow,x,y,z', ',', 'q1 = shoulder, q2 = elbow'),
         ('Q1,Q2,X,Y,Z', ',', 'no units are given'),
         ('q1,q2,x,y,z', ';', 'semicolon'),
-        ('q1,q2,x,y,z,Prüfung', ',', 'Windows-1252'),
+        ('q1,q2,x,y,z,Prüfung', ',', 'Windows-1252: if its words are wrong, save it as UTF-8'),
         ('q1,q2,x,y,z,Prüfung', ',', 'columns not read: Prüfung ('),
         ('q1,q2,x,y,z,UTF-16', ',', 'no units are given'),
     ],
