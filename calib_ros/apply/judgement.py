@@ -71,6 +71,8 @@ class Judgement:
     """What explains measurements that are further off than any arm."""
     noise: float
     """RMS [m] of the noise of a noisier device beyond the former error; 0 if not decisive."""
+    near: tuple[str, ...]
+    """Joints that move clearly less than in the calibration, of one that holds."""
 
     @property
     def failed(self) -> bool:
@@ -134,6 +136,7 @@ def judge(
         noise *= verdict != compared(limit, lower[0], upper[0])
     if reused and verdict != 'FAIL':
         verdict = 'no verdict'
+    verdict = STANDS.get(verdict, verdict) if tolerance is None else verdict
     return Judgement(
         comparison=found,
         limit=limit,
@@ -142,11 +145,12 @@ def judge(
         lower=float(lower[0]),
         upper=float(upper[0]),
         freedom=float(freedom[0]),
-        verdict=STANDS.get(verdict, verdict) if tolerance is None else verdict,
+        verdict=verdict,
         needed=None if verdict == 'no verdict' or not decided.size else int(decided[0]),
         reused=reused,
         mistake=mistake,
         noise=float(np.sqrt(noise)),
+        near=_near(arm, sets) if verdict == 'holds' else (),
     )
 
 
@@ -162,6 +166,12 @@ def _noise_beyond(arm: Calibration, sets: Sequence[Observations], stated: float 
     found = np.concatenate([each.covariances((now, 1.0))[:, :3, :3] for each in sets])
     former = max(3.0 * then**2, arm.residual**2)
     return max(0.0, float(np.trace(found.mean(axis=0))) - former)
+
+
+def _near(arm: Calibration, sets: Sequence[Observations]) -> tuple[str, ...]:
+    if arm.rows is None:
+        return ()
+    return tuple(np.array(arm.chain.joint_names)[arm.rows.narrow(sets)].tolist())
 
 
 def _mistake(

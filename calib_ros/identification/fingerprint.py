@@ -23,9 +23,9 @@ from scipy.spatial import cKDTree
 
 from calib_ros.decision.rounding import step_of
 from calib_ros.errors import ConfigError
-from calib_ros.estimation.levels import CERTAIN, FEW
+from calib_ros.estimation.levels import CERTAIN, FEW, NEARER
 from calib_ros.estimation.observations import Observations
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.settings import EXACT, Settings
 
 Hashes: TypeAlias = NDArray[np.uint64]
@@ -129,6 +129,15 @@ class Fingerprint:
         pairs = (sample, self.least), (rows, self.latest)
         same = [float(np.isin(own, kept).mean()) if own.size else 0.0 for own, kept in pairs]
         return max(same) or self._rounded(sets)
+
+    def narrow(self, sets: Sequence[Observations]) -> Flags:
+        """Return which joints (n,) move clearly less than in the kept rows of positions."""
+        joints = np.concatenate([each.joints for each in sets])
+        fitted = self.values[:, :-3]
+        if not len(fitted) or fitted.shape[1] != joints.shape[1]:
+            return np.zeros(joints.shape[1], dtype=bool)
+        spans = np.ptp(fitted, axis=0)
+        return np.asarray((spans > Settings.still) & (np.ptp(joints, axis=0) < NEARER * spans))
 
     def _rounded(self, sets: Sequence[Observations]) -> float:
         """Return the estimated share of rows that were fitted, whose values are rounded."""

@@ -46,6 +46,12 @@ def caveats(found: Verification) -> list[str]:
             'this judges the calibration, not the corrected robot: give the uncorrected program '
             '(--commanded) to test whether the correction reaches the arm'
         )
+    if found.near:
+        lines.append(
+            f'it holds near these poses only: {", ".join(some(found.near))} moved less than '
+            f'{100.0 * NEARER:g} % as far as for the calibration; for more, verify all over its '
+            'range'
+        )
     turned = turned_in_words(found.comparison.figures[1])
     return [*lines, turned] if turned and found.common >= NEARER else lines
 

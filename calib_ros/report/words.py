@@ -220,7 +220,8 @@ def verdict_in_words(found: Judgement) -> str:
             return f'the device has too much noise to tell whether the calibration holds: {told}'
         return f'too few poses to tell whether the calibration holds: {told}; measure more'
     turned = turned_in_words(now)
-    return f'the calibration holds: {told}' + f'; but {turned}' * bool(turned)
+    near = '; this is told only near these poses' * bool(found.near)
+    return f'the calibration holds: {told}{near}' + f'; but {turned}' * bool(turned)
 
 
 def turned_in_words(figures: ErrorFigures) -> str:

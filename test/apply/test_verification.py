@@ -18,8 +18,10 @@ from calib_ros.apply.verification import verify
 from calib_ros.apply.verified import Attained
 from calib_ros.decision.residuals import Residuals
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.identification.fingerprint import Fingerprint
 from calib_ros.report.standing import standing
 from calib_ros.report.verdicts import _by_configuration
+from calib_ros.report.words import verdict_in_words
 from calib_ros.shown import rounded
 
 _UNIT = ['(mean', '+', '3', 'std)']
@@ -105,6 +107,25 @@ def test_pass_fail_and_undecided(cell, arm, program):
     for k, (pose, row) in enumerate(zip(near.each, table[1:6], strict=True), 1):
         figures = (pose.before, pose.after, pose.repeatability)
         assert row == [str(k), '3', *map(rounded, figures)]
+
+
+def test_poses_in_a_small_part_of_the_range_hold_only_there(cell, arm):
+    """They said that the calibration holds, and not where."""
+    joints = UR.random_joints(30, np.random.default_rng(4))
+    elsewhere = 0.5 * joints
+    elsewhere[:, [0, 2]] *= 0.2
+    for each, near in ((joints, ()), (elsewhere, tuple(np.array(UR.joint_names)[[0, 2]]))):
+        found = verify(arm, [measured(cell[0], each, 1)], None)
+        assert found.verdict == 'holds'
+        assert found.near == near
+        assert (': shoulder_pan_joint, elbow_joint moved' in in_words(found)) == bool(near)
+        told = verdict_in_words(found)
+        assert ('only near these poses' in told) == bool(near)
+        assert len(told) <= 200  # in a window of the node
+        assert verify(arm, [measured(cell[0], each, 1)], 1e-3).near == ()  # of poses like these
+    unknown = replace(arm, rows=None), replace(arm, rows=Fingerprint.of([]))
+    seen = [measured(cell[0], elsewhere, 1)]
+    assert [verify(each, seen, None).near for each in unknown] == [(), ()]
 
 
 @pytest.mark.parametrize('shape', [(1.0, 1.0, 1.0), (1.0, 0.5, 0.2), (1.0, 0.1, 0.1)])
