@@ -118,9 +118,10 @@ def largest_of(problem: Problem) -> float:
 
     Of positions alone in proportion to the arm, if it is tiny.
     """
-    most, turned = problem.largest_error, any(each.oriented.any() for each in problem.sets)
-    tiny = 1.0 if turned else largest_error(problem) / most
-    return tiny * (most + LEVER * problem.largest_angle / 3.0)
+    most, size = problem.largest_error, largest_error(problem)
+    whole = most + LEVER * problem.largest_angle / 3.0
+    tiny = size < most and not any(each.oriented.any() for each in problem.sets)
+    return whole * size / most if tiny else whole
 
 
 def fits_each_side(problem: Problem, seen: Observations, stamp_ns: int) -> bool:
