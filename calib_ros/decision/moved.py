@@ -108,11 +108,11 @@ class Step:
     def told(self, number: int) -> str:
         """Return what moved in short, for an operator of the node who counts poses so."""
         again = ', measure again after ~/clear'
+        what = f'the zero of {self.what}' if self.kind in ZEROS else self.what
         if self.slow:
-            return f'{self.what} seems to move slowly, {self._size} in all: mix the order of poses'
+            return f'{what} seems to move slowly, {self._size} in all: mix the order of poses'
         if self.kind in OF_THE_ARM:
             return f'{OF_THE_ARM[self.kind]} changed before pose {number}{again}'
-        what = f'the zero of {self.what}' if self.kind in ZEROS else self.what
         moved = f'moved {self._size} before pose {number}' + ' and later again' * bool(self.later)
         if self.outdated:
             return f'{what} {moved} and {self._are} outdated{again}'
@@ -131,7 +131,9 @@ class Step:
         text, more = f'{thing} moved {size}{of} before {self._where}', ''
         if self.slow:
             text = f'{thing} seems to have moved slowly, {size} over the session{of}'
-            more = '; if the poses follow an order, errors of the arm may look so: mix them'
+            if self.kind == 'joint':
+                more = '; the correction is now off by half of that: see why, and measure again'
+            more += '; if the poses follow an order, errors of the arm may look so: mix them'
         elif self.kind in OF_THE_ARM:
             text, more = f'{thing} changed before {self._where}', f': poses differ {size}'
         if self.kind == 'load':

@@ -27,6 +27,7 @@ from calib_ros.decision.moved import (
     BEFORE_THAT,
     FROM_THERE,
     IN_THE_CELL,
+    OF_THE_ARM,
     ZERO,
     ZEROS,
     Step,
@@ -66,8 +67,7 @@ def find_step(fitted: Fitted) -> Step | None:
         scan, found = _searched(fitted, loaded=True)
     if found is not None:
         if found.stops[0] and _drifts(scan, found):
-            in_cell = found.group.kind in IN_THE_CELL
-            if not in_cell or fitted.problem.sets[found.group.sets[0]].socket:
+            if found.group.kind in OF_THE_ARM or fitted.problem.sets[found.group.sets[0]].socket:
                 return None
             twice = tuple(2.0 * size for size in found.sizes)  # the halves' means differ
             found = replace(found, sizes=twice, slow=True)
