@@ -47,8 +47,9 @@ def _values(each: Observations) -> FloatArray:
 
 
 def _of_positions(sets: Sequence[Observations]) -> FloatArray:
-    """Return the values (N, n + 3) of all rows of positions."""
-    found = [_values(each) for each in sets if each.distances is None and each.pixels is None]
+    """Return the values (N, n + 3) of all rows of positions; those in sockets are alike."""
+    every = (each for each in sets if each.distances is None and each.pixels is None)
+    found = [_values(each) for each in every if not each.socket]
     return np.concatenate(found) if found else np.zeros((0, 4))
 
 

@@ -101,3 +101,11 @@ def test_rows_written_with_fewer_digits_are_known_and_those_measured_again_are_n
         later = Fingerprint.of([rows(8, 2)], found)
         assert later.share([written]) == pytest.approx(share, abs=0.05)
         assert found.share([written.select(slice(1))]) == bare.share([written]) == 0.0
+
+
+def test_the_same_program_in_sockets_is_measured_again():
+    """All positions are zero there: joint values alone tell measurements apart."""
+    seen = replace(rows(60), positions=np.zeros((60, 3)), socket=True)
+    again = replace(seen, joints=seen.joints + 1e-4)
+    assert Fingerprint.of([seen]).share([again]) == 0.0
+    assert Fingerprint.of([seen]).share([seen]) == 1.0
