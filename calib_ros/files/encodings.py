@@ -18,8 +18,9 @@ from calib_ros.texts import LARGEST_TABLE, read_bytes
 WESTERN = ('Windows-1252', 'Latin-1')  # the last has all bytes
 NOT_CHINESE = re.compile(
     rb'(?<![\x80-\xff])(?!(?:[\xa1-\xd7][\xa1-\xfe])+(?![\x80-\xff]))[\x80-\xff]'
+    rb'|(?<=[A-Za-z]{2})[\x80-\xff]{2}(?=[A-Za-z])'
 )
-"""Bytes that are no pairs of usual Chinese characters; of accents few stand side by side."""
+"""Bytes that are no pairs of usual Chinese characters, or one within a word: POSIÇÃO."""
 
 
 def text_and_encoding(path: Path) -> tuple[str, str]:

@@ -19,7 +19,8 @@ from calib_ros.files.vocabulary import MEASURED_COLUMNS, POSITION
 from calib_ros.kinematics.se3 import Flags
 
 COMMENTS = ('#', '%', '//')
-NOT_VALID = ('0', '0.0', 'false', 'no', 'invalid')
+NOT_VALID = ('false', 'f', 'no', 'n', 'invalid')
+VALID = ('true', 't', 'yes', 'y', 'valid', 'ok')
 
 
 def without_words(
@@ -74,16 +75,27 @@ def drop_unmeasured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
         if measuring and (rows := rows_of(made)).any():
             left = f'{made.path}: {what} in {lines_in_words(made.lines[rows].tolist())}'
             if rows.all():
-                raise InputError(f'{left}: rows need x, y, z or distance')
+                other = 'rename it if it means something else'
+                need = other if rows_of is _not_valid else 'rows need x, y, z or distance'
+                raise InputError(f'{left}: {need}')
             notes.append(f'{left}: skipped')
             made = made.select(~rows)
+    words = [each not in VALID and np.isinf(cell_number(each)) for each in _valid(made)]
+    if any(words):
+        told = f'{made.path}: the column valid says {_valid(made)[words.index(True)]!r} in '
+        lines = lines_in_words(made.lines[words].tolist())
+        notes.append(f'{told}{lines}, or another word: read all the same; 0 leaves out a row')
     cells = {name: given for name, given in made.cells.items() if name != 'valid'}
     return replace(made, cells=cells), tuple(notes)
 
 
+def _valid(made: Columns) -> list[str]:
+    return [each.lower() for each in made.texts('valid')] if 'valid' in made.cells else []
+
+
 def _not_valid(made: Columns) -> Flags:
-    given = made.texts('valid') if 'valid' in made.cells else [''] * len(made.lines)
-    return np.array([cell.lower() in NOT_VALID for cell in given], dtype=bool)
+    left = [each in NOT_VALID or cell_number(each, ',') == 0.0 for each in _valid(made)]
+    return np.array(left or np.zeros(len(made.lines)), dtype=bool)
 
 
 def _lost(made: Columns) -> Flags:

@@ -134,6 +134,10 @@ def test_cells_in_quotes_windows_text_and_a_byte_order(read):
     table = read(named.encode('gbk'), columns={'q1': '关节1'})
     assert_same(table, None)
     assert 'GB18030' in ' '.join(table.warnings)
+    upper = PLAIN.replace('q1', 'POSIÇÃO').replace('q2', 'GRÖßE')  # both are pairs of bytes
+    table = read(upper.encode('cp1252'), columns={'q1': 'POSIÇÃO', 'q2': 'GRÖßE'})
+    assert_same(table, None)
+    assert 'Windows-1252' in ' '.join(table.warnings)
 
 
 MOTIVE = """Format Version,1.23,Take Name,take,Rotation Type,Quaternion,Length Units,Millimeters

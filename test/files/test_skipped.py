@@ -56,7 +56,7 @@ def test_statistics_below_a_table_are_no_poses(tmp_path, rows):
         assert any(note.startswith(f'{path}: statistics in line') for note in table.warnings)
 
 
-@pytest.mark.parametrize(('yes', 'no'), [('1', '0'), ('True', 'False')])
+@pytest.mark.parametrize(('yes', 'no'), [('1', '0'), ('True', 'False'), ('y', 'n')])
 def test_rows_that_a_column_calls_invalid_are_left_out(tmp_path, yes, no):
     """They were outliers: some trackers repeat the last position while the target is hidden."""
     path = tmp_path / 'cell.csv'
@@ -67,6 +67,23 @@ def test_rows_that_a_column_calls_invalid_are_left_out(tmp_path, yes, no):
         assert_same(table, None)
         told = f'{path}: the column valid says no in line 5: skipped'
         assert [note for note in table.warnings if 'valid' in note] == [told]
+
+
+def test_words_of_a_column_valid_are_told_if_unknown_and_all_are_not_left_out(tmp_path):
+    """They were read without a word, or a table needed x, y, z that it has."""
+    path = tmp_path / 'cell.csv'
+    first, *lines = PLAIN.splitlines()
+    for said in ('1', 'NOK', '0'):
+        path.write_text('\n'.join([f'{first},valid', *(f'{line},{said}' for line in lines), '']))
+        if said == '0':
+            with pytest.raises(InputError, match='rename it if it means something else'):
+                next(tables(path))
+            continue
+        for table in tables(path):
+            assert_same(table, None)
+            told = [note for note in table.warnings if 'column valid' in note]
+            assert len(told) == (said == 'NOK')
+            assert not told or "says 'nok' in lines 2, 3" in told[0]
 
 
 MANY = np.random.default_rng(7).normal(0.1, 0.8, (20, 5)).round(4)
