@@ -26,10 +26,10 @@ WAY = (
     ('calib_ros compensate program.csv --chain ur10e --calibration result/ ...', ''),
     ('calib_ros verify new.csv --chain ur10e --calibration result/', ''),
 )
-
-
 READING = ('--columns', '--length', '--angle', '--joint-angle', '--decimal', '--separator')
 """Options of commands that read tables of other systems, missed with programs."""
+PROGRAMS = ('compensate', 'plan', 'workspace')
+"""Commands that read programs and poses."""
 
 
 def unknown_word(word: str, parser: argparse.ArgumentParser) -> str:
@@ -44,7 +44,7 @@ def unknown_word(word: str, parser: argparse.ArgumentParser) -> str:
     bare = {action.metavar for action in parser._actions if not action.option_strings}
     if option == '--calibration' and (first := bare & {'RESULT', 'CALIBRATION'}):
         hint = f'give {first.pop()} first, without an option'
-    if option in READING:
+    if option in READING and parser.prog.endswith(PROGRAMS):
         hint = 'name columns and units in the first line of the file: q1 [deg]'
     return f'unknown option "{option}"' + (f': {hint}' if hint else '')
 

@@ -71,7 +71,8 @@ def _verified(
             history, unread = filed
             wanted = None if commanded is None else commanded.tolist()
             judged_by = (table_hash(arm.chain), options.tolerance, confidence, *moved, wanted)
-            about = inputs.filing_of(options, nominal, sets, unread, *judged_by)
+            stated = [] if sigma is None else [sigma]  # the settings have its default, too
+            about = inputs.filing_of(options, nominal, sets, unread, *judged_by, *stated)
             history.file(verification_row(arm.chain, found, about))
 
     for warning in warnings:

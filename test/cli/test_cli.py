@@ -145,6 +145,14 @@ def test_what_a_bag_leaves_out_is_told(run, tmp_path):
     assert (status, err) == (0, told)
 
 
+@pytest.mark.parametrize(('command', 'program'), [('robots', False), ('plan', True)])
+def test_a_command_without_a_program_does_not_ask_for_its_first_line(capsys, command, program):
+    with pytest.raises(SystemExit):
+        main([command, '--angle', 'deg'])
+    told = capsys.readouterr().err
+    assert ('"--angle"' in told, 'first line of the file' in told) == (True, program)
+
+
 @pytest.mark.parametrize('name', ['q', 'A'])
 def test_a_bag_is_made_of_any_table_that_identify_reads(run, tmp_path, name):
     """With the same options, which its message proposes."""
