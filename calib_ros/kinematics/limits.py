@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.errors import InputError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import TWO_TURNS
 from calib_ros.kinematics.effects import coupled
@@ -39,14 +39,18 @@ def beyond(values: FloatArray, chain: Chain) -> Flags:
 
 def narrowed(chain: Chain, other: Chain) -> Chain:
     """Return a chain whose joints keep the limits of another one, too."""
-    pairs = zip(chain.joints, other.joints, strict=True)
-    ends = [((a.lower, b.lower), (a.upper, b.upper)) for a, b in pairs]
-    given = [[[end for end in both if end is not None] for both in each] for each in ends]
-    joints = tuple(
-        replace(joint, lower=max(lower, default=None), upper=min(upper, default=None))
-        for joint, (lower, upper) in zip(chain.joints, given, strict=True)
-    )
-    return replace(chain, joints=joints)
+    joints = []
+    for joint, its in zip(chain.joints, other.joints, strict=True):
+        lower = max((end for end in (joint.lower, its.lower) if end is not None), default=None)
+        upper = min((end for end in (joint.upper, its.upper) if end is not None), default=None)
+        if lower is not None and upper is not None and lower > upper:
+            raise ConfigError(
+                f'the limits of {joint.name} in the calibration and in the nominal chain have no '
+                f'value in common: it is at least {lower:.6g} in one, at most {upper:.6g} in the '
+                'other (rad or m): put the chain right, or identify with its limits'
+            )
+        joints.append(replace(joint, lower=lower, upper=upper))
+    return replace(chain, joints=tuple(joints))
 
 
 def a_turn_away(joint: Joint, value: float) -> str:

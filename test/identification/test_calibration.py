@@ -64,6 +64,9 @@ def test_joints_keep_the_limits_of_the_file_and_of_the_nominal_chain(found):
         assert [joint.lower for joint in chain.joints] == [free, *[held] * 5]
         assert [joint.upper for joint in chain.joints] == [joint.upper for joint in UR.joints]
     assert again.region.chain.joints[1].lower == UR.joints[1].lower
+    apart = replace(UR, joints=(*UR.joints[:5], replace(UR.joints[5], lower=7.0, upper=8.0)))
+    with pytest.raises(ConfigError, match=r'wrist_3_joint .*no value in common: .*6\.28319 in'):
+        parse_calibration(found.dump(), 'file', apart)
 
 
 @pytest.fixture(scope='module')
