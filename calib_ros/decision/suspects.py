@@ -100,7 +100,7 @@ def _arm_mistakes(chain: Chain, sets: Sets) -> Iterator[Suspect]:
     yield from _of_lengths(
         'linear joints', _linear(chain), partial(scale_joints, chain, 'prismatic')
     )
-    yield from _of_joints(chain, sets[0].socket)
+    yield from _of_joints(chain, sets[0])
     yield from _of_one_unit(chain)
     yield from _of_arms(chain)
     yield from _of_frames(chain, sets)
@@ -257,28 +257,24 @@ def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:
             yield found
 
 
-def _of_joints(chain: Chain, socket: bool) -> Iterator[Suspect]:
-    """Yield signs, zeros, order and couplings of joints, perhaps with the target in a socket."""
+def _of_joints(chain: Chain, seen: Observations) -> Iterator[Suspect]:
+    """Yield signs, zeros, order, rest and couplings of joints, perhaps with a ball in a socket."""
     names = chain.joint_names
     last, same = len(names), np.eye(len(names))
-    revolute = [joint.type == 'revolute' for joint in chain.joints]
-    for k in range(len(names)):
-        yield from _of_joint(chain, k)
-    for i, j in combinations(range(len(names)), 2):
-        order = np.arange(len(names))
-        order[[i, j]] = j, i
+    yield from (each for k in range(last) for each in _of_joint(chain, k))
+    for i, j in combinations(range(last), 2):
+        swap = [{i: j, j: i}.get(k, k) for k in range(last)]
         what = f'{names[i]} and {names[j]} are swapped'
         remedy = f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}'
         published = 'swap them in joint_names, start without resume'
-        change = (joint_map(same[order]),)
-        yield Suspect(what, remedy, change, 2, published=published, part='order')
+        yield Suspect(what, remedy, (joint_map(same[swap]),), 2, published=published, part='order')
     orders = {'in the order from tool to base': [*range(last)][::-1]} if last > 3 else {}
     for more in (1, 2) if last > 6 else ():  # external axes, which controllers name last
         where = f'in another order, {" and ".join(names[:more])} last'
         orders[where] = [*range(last - more, last), *range(last - more)]
     for where, places in orders.items():
         yield replace(reordered(f'the joints are {where}', places, rank=2), part='order')
-    least = last - 1 if socket else 1  # on the first axes a ball stays in any socket
+    least = last - 1 if seen.socket else 1  # on the first axes a ball stays in any socket
     tails = (('target does not move', slice(k, last)) for k in range(last - 1, least - 1, -1))
     for stands, which in (('device moves', slice(1)), *tails):
         listed = ', '.join(names[which])
@@ -286,8 +282,12 @@ def _of_joints(chain: Chain, socket: bool) -> Iterator[Suspect]:
         columns = ','.join(f'q{k + 1}=0' for k in range(last)[which])
         still = joint_map(same - np.diag(same[which].sum(axis=0)))
         yield Suspect(what, f'{remedy}, or --columns {columns}', (still,), published=remedy)
-    for k in range(1, len(names)):
-        for way in '+-' if revolute[k] and revolute[k - 1] else '':
+    for k in range(1, 0 if seen.socket else last - 1):
+        rested = joint_map(same - np.diag(same[k]), seen.joints[0] * same[k])
+        remedy = 'check its brake, clutch and encoder, and measure again'
+        yield Suspect(f'{names[k]} did not move', remedy, (rested,), published=remedy)
+    for k in range(1, last):
+        for way in '+-' * (chain.joints[k - 1].type == chain.joints[k].type == 'revolute'):
             coupled = same + float(f'{way}1') * np.outer(same[k], same[k - 1])
             what = f'{names[k]} is not given against {names[k - 1]}: they are coupled'
             remedy = f'--columns q{k + 1}=q{k + 1}{way}q{k}'

@@ -39,6 +39,7 @@ RANKS = {
     'the joints are in the order from tool to base': (2, 'order'),
     f'the joints are in another order, {LAST}': (2, 'order'),
     'the device moves with linear_axis_joint': (1, ''),
+    'elbow_joint did not move': (1, ''),
     'elbow_joint is not given against shoulder_lift_joint: they are coupled': (2, 'elbow_joint'),
     'elbow_joint is in degrees, the other joints in radians': (2, 'elbow_joint'),
     'the DH table is in the modified convention, not the standard one': (3, ''),
@@ -67,7 +68,8 @@ def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
         'shoulder_pan_joint is not given against linear_axis_joint: they are coupled' not in found
     )
     sister = replace(load_chain('ur5e'), base=None, tool=None)
-    others = [e for e in suspects(sister, (seen.select(np.arange(0)),)) if 'arm is a' in e.what]
+    of_six = seen.changed(joints=seen.joints[:, 1:])
+    others = [e for e in suspects(sister, (of_six,)) if 'arm is a' in e.what]
     assert {each.rank for each in others} == {2}
     assert 'ur10e' in {each.chain.name for each in others}
 
@@ -83,6 +85,16 @@ def test_a_target_that_the_last_joints_do_not_move_is_named(rng, oriented):
     last = ', '.join(nominal.joint_names[3:])
     named = f'does not move with {last}: leave {last} out of the chain file, or --columns q4=0,'
     assert named in identify(Problem(nominal, seen)).refusals[0]
+
+
+@pytest.mark.parametrize(('joint', 'oriented'), [(1, False), (2, False), (2, True)])
+def test_a_joint_that_stood_still_is_named(rng, joint, oriented):
+    """It was said that linear joints were in mm, cm or inches, or the elbow in degrees."""
+    true, joints = faulty(SCARA, Cell(), rng), SCARA.random_joints(40, rng)
+    stood = np.where(np.arange(4) == joint, joints[0], joints)
+    seen = measure(true, stood, rng, 5e-5, 2e-4, oriented).changed(joints=joints)
+    reason = identify(Problem(SCARA, seen)).refusals[0]
+    assert reason.startswith(f'{SCARA.joint_names[joint]} did not move: check its brake, ')
 
 
 @pytest.mark.parametrize('robot', ['staubli_tx90l', 'franka_panda'])
