@@ -92,8 +92,10 @@ class Inference:
         (evidence, size, wider, near), arm = columns.plausible, columns.arm
         rival, device, checked = None, np.zeros(1), bool(fitted.problem.sigma_scale)
         if columns.scaled and fitted.held is None and (checked or columns.scale < PRINTED):
-            elsewhere = columns.evidence(max(OUT_OF_SCALE, columns.scale))
-            odds, mean, covariance = elsewhere.odds_against(evidence, size, columns.considered)
+            far = max(OUT_OF_SCALE, columns.scale)
+            rivals = [columns.evidence(far, alone) for alone in (False, True)[: 1 + strained]]
+            against = (r.odds_against(evidence, size, columns.considered) for r in rivals)
+            odds, mean, covariance = max(against, key=lambda each: each[0])
             # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
             odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
             rival, device = (odds, mean[arm], covariance[arm, arm]), mean[arm.stop :]
@@ -153,12 +155,18 @@ class _Columns:
         self._groups = groups + [None] * rest
         self._given = [known.get(name, np.inf) for name in self.names] + [1.0] * rest
 
-    def evidence(self, scale: float | None = None) -> Evidence:
-        """Return the evidence; with another usual `scale` of the device that nobody checked."""
-        typical = TYPICAL | {'scale': self.scale if scale is None else scale}
-        checked = self._checked if scale is None else 0.0
-        groups = self._groups + [None if checked else 'scale'] * self._device
-        given = np.array(self._given + [checked or np.inf] * self._device)
+    def evidence(self, scale: float | None = None, alone: bool = False) -> Evidence:
+        """Return the evidence; with another usual `scale` of the device that nobody checked.
+
+        Of that `alone`, or also of its strains.
+        """
+        far = self.scale if scale is None else scale
+        typical = TYPICAL | {'scale': self.scale if alone else far}
+        known = [self._checked if alone or scale is None else 0.0] * self._device
+        if alone:
+            known[-1] = far
+        groups = self._groups + [None if each else 'scale' for each in known]
+        given = np.array(self._given + [each or np.inf for each in known])
         return Evidence(*self.normal, given**-2.0, groups, typical)
 
     @cached_property

@@ -137,6 +137,17 @@ def test_linear_joints_do_not_hide_that_a_strained_device_may_harm(seed, size):
         assert 'one direction' in refusal
 
 
+@pytest.mark.parametrize('seed', [0, 5, 7])
+def test_linear_joints_do_not_hide_a_scale_alike_in_all_directions(seed):
+    """Strains near zero contradicted it: these SCARAs were accepted and got worse."""
+    rng, true = np.random.default_rng(seed), arm(seed, chain=SCARA)
+    seen = measure(true, SCARA.random_joints(50, rng), rng, *NOISE)
+    seen = replace(seen, positions=1.002 * seen.positions)
+    (refusal,) = identify(Problem(SCARA, seen, **SIGMAS)).refusals
+    assert refusal.rule is Rule.SCALE
+    assert refusal.startswith('all lengths of the arm grow alike, by 0.2')
+
+
 @pytest.mark.parametrize(
     ('fixed', 'seed', 'off'), [('*.a', 1, 0.0), ('base.*', 1, 3e-3), ('base.*', 0, 3e-2)]
 )
