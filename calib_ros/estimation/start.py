@@ -142,9 +142,8 @@ def _start_one(
     places = subset.given if subset.seen else subset.positions
     spread = float(np.sqrt(np.var(places, axis=0).sum()))
     determined: tuple[str, ...] = ()
-    found, lowest = chain, np.inf
+    best, least, left = chain, np.inf, np.full_like(subset.positions, np.inf)
     for starts in _starts(chain, subset):
-        best, least, left = chain, np.inf, np.full_like(subset.positions, np.inf)
         for start in starts:
             away = norms(residual_arrays(start, subset)[0] - left)
             if np.median(away) <= EXCEPTION * spread:  # the same valley
@@ -155,13 +154,9 @@ def _start_one(
             error = np.median(norms(residual))  # robust
             if error < least:
                 best, least, determined, left = fitted, error, chosen, residual
-        best = robust_fit(best, determined, system, loss).fit.chain
-        error = np.median(norms(residual_arrays(best, subset)[0]))
-        if error < lowest:
-            found, lowest = best, error
-        if lowest <= EXCEPTION**2 * spread:  # of two joints other valleys have 4 %
+        if least <= EXCEPTION * spread:  # no other valley is as low
             break
-    return found
+    return robust_fit(best, determined, system, loss).fit.chain
 
 
 def _starts(chain: Chain, observations: Observations) -> Iterator[Iterator[Chain]]:
