@@ -21,6 +21,12 @@ def refuse_empty(what: str, corners: FloatArray) -> None:
         raise ConfigError(f'the {what} from {given} is empty: give the lower corner first')
 
 
+def refuse_millimetres(what: str, given: FloatArray) -> None:
+    """Refuse coordinates (N,) or corners (2, 3) [m] that no cell has."""
+    if (np.abs(given) > 100.0).any():
+        raise ConfigError(f'the {what} must be in metres (300 mm is 0.3), not {given.tolist()}')
+
+
 @dataclass(frozen=True, eq=False)
 class Visibility:
     """Where the measuring device sees the target.
@@ -40,9 +46,8 @@ class Visibility:
         if self.box is not None:
             refuse_empty('box', self.box)
         for name, given in (('box', self.box), ('tracker', self.tracker)):
-            far = () if given is None or self.world else np.abs(given).ravel()
-            if any(100.0 < each < np.inf for each in far):
-                raise ConfigError(f'the {name} must be in metres (300 mm is 0.3), not {given}')
+            if given is not None and not self.world:
+                refuse_millimetres(name, np.extract(np.isfinite(given), given))
         if self.tracker is not None and not np.isfinite(self.tracker).all():
             raise ConfigError(f'the tracker must be at a place in metres, not at {self.tracker}')
         if not np.linalg.norm(self.axis) > 0.0:

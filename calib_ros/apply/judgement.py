@@ -31,7 +31,6 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.se3 import Index
-from calib_ros.settings import Settings
 from calib_ros.shown import rounded
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
@@ -178,8 +177,6 @@ def _near(arm: Calibration, sets: Sequence[Observations]) -> tuple[str, ...]:
 def _mistake(
     arm: Calibration, sets: Sequence[Observations], error: float, angle: float, of_messages: bool
 ) -> Diagnosis | None:
-    if error <= CLEARLY * Settings.sigma_position and angle <= Settings.largest_angle:
-        return None  # usual for an arm of any size
     problem = Problem(arm.before, sets[0], more=sets[1:], of_messages=of_messages)
     most = largest_error(problem)
     if error <= most and angle <= problem.largest_angle:

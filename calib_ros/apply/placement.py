@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib_ros.annotated import Count, as_annotated
-from calib_ros.apply.candidates import refuse_empty
+from calib_ros.apply.candidates import refuse_empty, refuse_millimetres
 from calib_ros.apply.task import Search
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
@@ -69,8 +69,7 @@ def place(
     search = Search(arm, task, aim, model, progress)
     corners = search.reach if region is None else region
     refuse_empty('region', corners)
-    if (np.abs(corners) > 100.0).any():
-        raise ConfigError(f'the region must be in metres (300 mm is 0.3), not {corners.tolist()}')
+    refuse_millimetres('region', corners)
     if cells**3 * turns > LARGEST:
         raise ConfigError(
             f'{cells} cells along each axis and {turns} turns are {cells**3 * turns:,} '

@@ -15,12 +15,10 @@ from calib_ros.errors import InputError
 from calib_ros.files.columns import Cells, Columns, cell_number, lines_in_words
 from calib_ros.files.names import MEASURED_WORDS, NOMINAL_TITLES, TITLE_WORDS, words_of
 from calib_ros.files.summary_rows import rows_of_statistics
-from calib_ros.files.vocabulary import MEASURED_COLUMNS, POSITION
+from calib_ros.files.vocabulary import MEASURED_COLUMNS, NOT_VALID, POSITION, VALID
 from calib_ros.kinematics.se3 import Flags
 
 COMMENTS = ('#', '%', '//')
-NOT_VALID = ('false', 'f', 'no', 'n', 'invalid')
-VALID = ('true', 't', 'yes', 'y', 'valid', 'ok')
 
 
 def without_words(

@@ -76,6 +76,9 @@ WORDS = (
     *SOCKETS,
 )
 """Columns of text."""
+NOT_VALID = ('false', 'f', 'no', 'n', 'invalid')
+VALID = ('true', 't', 'yes', 'y', 'valid', 'ok')
+"""Words in the column valid, beside numbers."""
 NUMBERS = (*POSE_COLUMNS, *TURNS, *IN_TURN, *MATRIX, *SIGMAS, 'distance', 'time', 'delay')
 JOINT = re.compile('[qsva][0-9]+')
 """Columns with a number of each joint: values, signs of last moves, and rates."""

@@ -18,6 +18,7 @@ from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.residuals import Residuals
 from calib_ros.estimation.noise import Noise
+from calib_ros.estimation.observations import Observations
 from calib_ros.files.result_rows import verification_row
 from calib_ros.files.rows import Filing
 from calib_ros.identification.calibration import Calibration
@@ -31,6 +32,8 @@ from calib_ros.report.reports import CLOSER, may_be_closer
 from calib_ros.report.standing import standing
 from calib_ros.report.words import rms_range_mm, still_holds, verdict_in_words
 from calib_ros.shown import rounded, sentence
+
+SEEN = Observations.from_arrays(np.zeros((1, 6)), np.zeros((1, 3)))
 
 
 def off_by(*errors_mm, turn=np.nan):
@@ -54,7 +57,7 @@ def test_a_calibration_holds_by_one_rule(rms_mm, says):
         Recalibration(previous, (), 1.0, judged, 1e-4, 1e-4, 0.0)
         for judged in (both, replace(both, before=less))  # predicted worse by 1.7
     ]
-    found = judge(previous, (), both)
+    found = judge(previous, [SEEN], both)
     told = verdict_in_words(found)
     assert found.verdict == says
     assert '; the limit is 0.150 mm' in told
@@ -71,7 +74,7 @@ def test_a_calibration_holds_by_one_rule(rms_mm, says):
         (replace(previous, rows=fitted), 'fitted to 30 % of these measurements'),
     ):
         kept = says == 'does not hold' and of.residual is not None
-        found = judge(of, (), both)
+        found = judge(of, [SEEN], both)
         assert found.verdict == ('does not hold' if kept else 'no verdict')
         assert (why in verdict_in_words(found)) != kept
     assert [each.accepted for each in updates] == [True, False]
@@ -83,7 +86,7 @@ def test_a_calibration_holds_by_one_rule(rms_mm, says):
 def test_a_single_pose_proves_little(rms_mm, says):
     """One of 14 of a sound arm was enough for "no longer holds"."""
     arm = load_chain('ur10e')
-    found = judge(Calibration(arm, arm, residual=1e-4), (), off_by(rms_mm))
+    found = judge(Calibration(arm, arm, residual=1e-4), [SEEN], off_by(rms_mm))
     assert found.verdict == says
     assert 'on 1 pose measured since' in verdict_in_words(found)
 
@@ -91,7 +94,7 @@ def test_a_single_pose_proves_little(rms_mm, says):
 def test_noise_that_no_number_of_poses_overcomes_asks_for_no_more_of_them():
     """~/validate asked for more poses, where `verify` named the noise of the device."""
     arm = load_chain('ur10e')
-    found = judge(Calibration(arm, arm, residual=1e-4), (), off_by(*[0.16] * 20))
+    found = judge(Calibration(arm, arm, residual=1e-4), [SEEN], off_by(*[0.16] * 20))
     assert verdict_in_words(replace(found, noise=1e-4)).endswith('; measure more')  # they decide
     told = verdict_in_words(replace(found, noise=1e-4, needed=None))
     assert told.startswith('the device has too much noise to tell')
