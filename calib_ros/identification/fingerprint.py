@@ -89,7 +89,8 @@ class Fingerprint:
             return cls(len(new), least[:KEPT], values=values)
         both = np.union1d(earlier.least, earlier.comparable(new))[:KEPT]
         latest = np.concatenate([new, earlier.latest])[:KEPT]
-        values = np.concatenate([v for v in (values, earlier.values) if len(v)] or [values])
+        width = (values if len(values) else earlier.values).shape[1]  # a file may have any
+        values = np.concatenate([v for v in (values, earlier.values) if v.shape[1] == width])
         return cls(earlier.count + len(new), both, latest, values[:KEPT])
 
     def comparable(self, rows: Hashes) -> Hashes:

@@ -109,3 +109,13 @@ def test_the_same_program_in_sockets_is_measured_again():
     again = replace(seen, joints=seen.joints + 1e-4)
     assert Fingerprint.of([seen]).share([again]) == 0.0
     assert Fingerprint.of([seen]).share([seen]) == 1.0
+
+
+@pytest.mark.parametrize('width', [1, 4, 9])
+def test_kept_rows_of_another_width_are_no_rows_of_this_arm(width):
+    """An update of a file with them ended in a traceback."""
+    other = Fingerprint.of([rows(3)]).document() | {'values': ['00' * 4 * width]}
+    found = Fingerprint.of_record({'rows': other}, 'file')
+    assert found.share([rows(60, 1)]) == 0.0
+    assert not found.narrow([rows(60, 1)]).any()
+    assert Fingerprint.of([rows(8, 2)], found).share([rows(8, 2)]) == 1.0
