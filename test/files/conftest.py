@@ -11,6 +11,12 @@ from calib_ros.files.layouts import Layout
 
 
 @pytest.fixture
+def path(tmp_path):
+    """Return the path of a table that is not yet written."""
+    return tmp_path / 'cell.csv'
+
+
+@pytest.fixture
 def read(tmp_path):
     def read(text, name='cell.csv', joints=2, **layout):
         path = tmp_path / name

@@ -57,8 +57,7 @@ FORMS = {
 
 
 @pytest.mark.parametrize('form', FORMS)
-def test_a_table_in_another_form_is_the_same(read, tmp_path, form):
-    path = tmp_path / 'cell.csv'
+def test_a_table_in_another_form_is_the_same(read, path, form):
     assert_same(read(FORMS[form]), None)
     assert_same(loading.table(path, ARM, Settings()), None)
 
@@ -107,9 +106,8 @@ def test_rows_that_name_the_joints_are_no_header_of_numbered_columns(tmp_path):
         ('\n"1,2,3,4,5,\n1,2,3,4,6,"', 'whole rows are within quotation marks'),
     ],
 )
-def test_a_quotation_mark_hides_no_rows(tmp_path, rows, said):
+def test_a_quotation_mark_hides_no_rows(path, rows, said):
     """Those below an open one, or between two ditto marks, were one cell that nobody reads."""
-    path = tmp_path / 'cell.csv'
     path.write_text(f'q1,q2,x,y,z,note\n1,2,3,4,5,a\n{rows}\n')
     line = 3 if rows.startswith('1') else 4
     for foreign in (None, Foreign(Layout())):
@@ -117,8 +115,7 @@ def test_a_quotation_mark_hides_no_rows(tmp_path, rows, said):
             read_table(path, 2, foreign=foreign)
 
 
-def test_a_note_of_several_lines_is_one_cell(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_a_note_of_several_lines_is_one_cell(path):
     path.write_text(
         PLAIN.replace('q1', 'note,q1', 1).replace('\n', '\n"hot, windy,\n12"" tool",', 3)
     )
@@ -127,8 +124,7 @@ def test_a_note_of_several_lines_is_one_cell(tmp_path):
 
 
 @pytest.mark.parametrize('note', ['a, b, c, d, e\nf', 'a, b\nc, d, e, f', 'a\n, b, c\nd', 'a\rb'])
-def test_a_note_with_as_many_commas_as_a_row_hides_none(tmp_path, note):
-    path = tmp_path / 'cell.csv'
+def test_a_note_with_as_many_commas_as_a_row_hides_none(path, note):
     rows = f'q1,q2,x,y,z,note\n1,2,3,4,5,\n1,2,3,4,6,"{note}"\n1,2,3,4,7,\n'
     path.write_bytes(rows.encode())  # as they are
     (found,) = read_table(path, 2).fitted
@@ -140,9 +136,8 @@ def test_a_number_of_a_column_that_is_not_there_is_told(read):
         read(PLAIN, columns={'session': '#9'})
 
 
-def test_points_between_thousands_are_no_decimals(read, tmp_path):
+def test_points_between_thousands_are_no_decimals(read, path):
     """Beside decimal commas; where neither is told from the other, both are refused."""
-    path = tmp_path / 'cell.csv'
     (found,) = read('q1;q2;x [mm];y [mm];z [mm];session\n0.642;0,5;999,5;356;1554;B 1,5\n').fitted
     np.testing.assert_allclose(found.joints, [[0.642, 0.5]])
     np.testing.assert_allclose(found.positions, [[0.9995, 0.356, 1.554]])
@@ -177,8 +172,7 @@ def test_joint_values_that_all_have_three_decimals_after_a_comma_are_read(tmp_pa
         read_table(path, 2, foreign=Foreign(Layout(), log=log))
 
 
-def test_stamps_in_seconds_are_told_what_to_give(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_stamps_in_seconds_are_told_what_to_give(path):
     path.write_text('stamp_ns,q1,q2,x,y,z\n1700000000.25,1,2,3,4,5\n')
     with pytest.raises(InputError, match='in seconds, give --columns time=stamp_ns'):
         read_table(path, 2)
@@ -195,8 +189,7 @@ def test_a_time_with_decimal_commas_is_no_date(guessed):
     assert found.stamps_ns.tolist() == [250_000_000, 500_000_000]
 
 
-def test_empty_stamps_are_lines_and_rows_without_any_measurement_are_told(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_empty_stamps_are_lines_and_rows_without_any_measurement_are_told(path):
     path.write_text('stamp_ns,q1,q2,x,y,z\n-,1,2,3,4,5\n7,1,2,3,4,5\n')
     assert read_table(path, 2).fitted[0].stamps_ns.tolist() == [2_000_000_000, 7]
     path.write_text('q1,q2,x,y,z\n1,2,-,-,-\n1,2,nan,nan,nan\n')
@@ -204,9 +197,8 @@ def test_empty_stamps_are_lines_and_rows_without_any_measurement_are_told(tmp_pa
         read_table(path, 2)
 
 
-def test_rotation_matrices(guessed, tmp_path):
+def test_rotation_matrices(guessed, path):
     """In nine columns, or in a flattened homogeneous matrix."""
-    path = tmp_path / 'cell.csv'
     turned = TURNED.as_matrix().reshape(-1, 9)
     assert_same(guessed(text_of(JOINTS, PLACES, turned, names=[*'abxyz', *MATRIX])))
     sizes = Layout(columns={f's{each}': '1e-3' for each in ('x', 'y', 'z', 'rx', 'ry', 'rz')})
@@ -264,9 +256,8 @@ def test_a_table_beside_a_log_is_not_asked_for_joint_values(tmp_path):
         ('1,2,3,4,5\n1,2,3,4,5,hot\n1,2,3,4,6\n', 0),
     ],
 )
-def test_rows_with_a_number_more_than_the_header_are_refused(tmp_path, rows, line):
+def test_rows_with_a_number_more_than_the_header_are_refused(path, rows, line):
     """Their numbers were read one column further, without a word; a remark is none."""
-    path = tmp_path / 'cell.csv'
     path.write_text(f'q1,q2,x,y,z\n{rows}')
     if not line:
         assert len(read_table(path, 2, foreign=Foreign(Layout())).fitted[0]) == 3
@@ -291,9 +282,8 @@ def test_a_header_that_may_lack_the_name_of_a_column_is_refused(guessed):
 @pytest.mark.parametrize(
     'text', ['0,1,2,3,4,5\n,1,2,3,4,5\n', 'a log\n1,1,2,3,4,5\n2,1,2,3,4,5,7\n']
 )
-def test_rows_without_a_header_have_no_number_too_many(tmp_path, text):
+def test_rows_without_a_header_have_no_number_too_many(path, text):
     """A blank first cell was told as one beyond a header of no columns."""
-    path = tmp_path / 'cell.csv'
     path.write_text(text)
     numbered = Layout(columns={'q1': '#2', 'q2': '#3', 'x': '#4', 'y': '#5', 'z': '#6'})
     (found,) = read_table(path, 2, foreign=Foreign(numbered)).fitted
@@ -331,17 +321,15 @@ GANTRY = Chain('gantry', 'standard', tuple(Joint(name, 'prismatic') for name in 
         ('x,y,z', 'q1=x,q2=y,q3=z,x=NAME,y=NAME,z=NAME"'),
     ],
 )
-def test_joints_called_as_the_positions_are_are_told_apart(tmp_path, header, said):
-    path = tmp_path / 'cell.csv'
+def test_joints_called_as_the_positions_are_are_told_apart(path, header, said):
     numbers = ','.join(map(str, range(header.count(',') + 1)))
     path.write_text(f'{header}\n{numbers}\n{numbers}\n')
     with pytest.raises(InputError, match=f'--columns "{re.escape(said)}'):
         read_table(path, 3, foreign=Foreign(Layout(), GANTRY))
 
 
-def test_axes_in_small_letters_are_no_accelerations(tmp_path):
+def test_axes_in_small_letters_are_no_accelerations(path):
     """They were joint values and accelerations."""
-    path = tmp_path / 'cell.csv'
     path.write_text('a1 [deg],a2 [deg],x,y,z\n1,2,3,4,5\n2,3,4,5,6\n')
     arm = Chain('arm', 'standard', (Joint('A1'), Joint('A2')))
     (found,) = read_table(path, 2, foreign=Foreign(Layout(), arm)).fitted
@@ -350,16 +338,14 @@ def test_axes_in_small_letters_are_no_accelerations(tmp_path):
 
 
 @pytest.mark.parametrize('named', [{}, {'x': 'X', 'y': 'Y', 'z': 'Z'}])
-def test_a_column_is_not_a_joint_value_and_a_position(tmp_path, named):
-    path = tmp_path / 'cell.csv'
+def test_a_column_is_not_a_joint_value_and_a_position(path, named):
     path.write_text('A1,A2,A3,X,Y,Z\n1,2,3,4,5,6\n2,3,4,5,6,7\n')
     arm = Chain('gantry', 'standard', tuple(Joint(name, 'prismatic') for name in 'XYZ'))
     with pytest.raises(InputError, match=re.escape('--columns "q*=A*"')):
         read_table(path, 3, foreign=Foreign(Layout(columns=named), arm))
 
 
-def test_the_joints_of_a_gantry_in_capitals_are_no_positions(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_the_joints_of_a_gantry_in_capitals_are_no_positions(path):
     path.write_text('X,Y,Z,x,y,z\n1,2,3,4,5,6\n2,3,4,5,6,7\n')
     arm = Chain('gantry', 'standard', tuple(Joint(name, 'prismatic') for name in 'XYZ'))
     for found in (
@@ -370,14 +356,13 @@ def test_the_joints_of_a_gantry_in_capitals_are_no_positions(tmp_path):
         assert found.fitted[0].positions.tolist() == [[4, 5, 6], [5, 6, 7]]
 
 
-def test_the_joints_with_motors_of_an_arm_whose_hand_is_kept_level_are_told(tmp_path):
+def test_the_joints_with_motors_of_an_arm_whose_hand_is_kept_level_are_told(path):
     joints = [
         Joint(f'j{k}', a=0.5, lower=0 if k == 2 else None, upper=0 if k == 2 else None)
         for k in (1, 2, 3)
     ]
     level = (('j2.coupling_joint_j1', -1.0),)
     arm = Chain('level', 'standard', tuple(joints), effects=level)
-    path = tmp_path / 'cell.csv'
     path.write_text('q1,q2,x,y,z\n1,2,3,4,5\n2,2,3,4,6\n')
     with pytest.raises(InputError, match='joints with motors: --columns "q3=#2,q2=0"'):
         read_table(path, 3, foreign=Foreign(Layout(), arm))

@@ -172,9 +172,8 @@ def test_a_row_written_twice_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize('device', ['ball', 'a,b'])
-def test_a_journal_of_any_length_is_read(tmp_path, monkeypatch, device):
+def test_a_journal_of_any_length_is_read(path, monkeypatch, device):
     """By parts, which are not seen: what is taken back, repeated, damaged or cut off is found."""
-    path = tmp_path / 'cell.csv'
     many = [plain(k, device=device) for k in range(1, 30)]
     many[7:9] = [plain(8, device='other'), replace(plain(9), covariance=covariance(9))]
     written(path, many)
@@ -200,8 +199,7 @@ def test_a_journal_of_any_length_is_read(tmp_path, monkeypatch, device):
 
 
 @pytest.mark.parametrize('sessions', [('b', 'a'), ('a',)])
-def test_a_journal_longer_than_any_table_is_identified(tmp_path, monkeypatch, sessions):
-    path = tmp_path / 'cell.csv'
+def test_a_journal_longer_than_any_table_is_identified(path, monkeypatch, sessions):
     many = [plain(k, session='ab'[k % 3 == 0]) for k in range(1, 30)]
     written(path, many)
     with path.open('ab') as file:
@@ -225,9 +223,8 @@ def test_a_journal_longer_than_any_table_is_identified(tmp_path, monkeypatch, se
 
 @pytest.mark.parametrize('name', ['ball', 'a,b', 'say "ball"', 'Kugel \u00e4\u2460'])
 @pytest.mark.parametrize('share', np.linspace(0.02, 0.98, 5))
-def test_a_row_that_was_cut_off_anywhere_is_left_out(tmp_path, name, share):
+def test_a_row_that_was_cut_off_anywhere_is_left_out(path, name, share):
     """Whatever is in it: the rows before are there, and new ones can be added."""
-    path = tmp_path / 'cell.csv'
     written(path, [plain(1, target=name)])
     begin = path.stat().st_size
     written(path, [plain(2, target=name)])
@@ -240,8 +237,7 @@ def test_a_row_that_was_cut_off_anywhere_is_left_out(tmp_path, name, share):
     assert_equal(read_journal(path, JOINTS)[0], [plain(1, target=name), plain(3, target=name)])
 
 
-def test_a_journal_read_with_the_unit_of_another_system_keeps_stamps_and_removals(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_a_journal_read_with_the_unit_of_another_system_keeps_stamps_and_removals(path):
     with closing(Journal(path, JOINTS)) as journal:
         for number, removed in ((1, False), (2, False), (3, False), (2, True)):
             journal.add(plain(number, rotation=np.eye(3), delay=0.01), removed)
@@ -252,9 +248,8 @@ def test_a_journal_read_with_the_unit_of_another_system_keeps_stamps_and_removal
     np.testing.assert_allclose(found.positions, 1e-3 * known.positions, rtol=1e-12)
 
 
-def test_a_leading_slash_makes_no_other_frame(tmp_path):
+def test_a_leading_slash_makes_no_other_frame(path):
     """Journals of earlier versions have it, the messages that continue them no longer do."""
-    path = tmp_path / 'cell.csv'
     with closing(Journal(path, JOINTS)) as journal:
         for number, frame in enumerate(('/tracker', 'tracker', ''), 1):
             journal.add(plain(number, rotation=np.eye(3), frame_id=frame))
@@ -263,8 +258,7 @@ def test_a_leading_slash_makes_no_other_frame(tmp_path):
     assert read_table(path, JOINTS).world_frame == 'tracker'
 
 
-def test_a_header_that_was_cut_off_is_written_anew(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_a_header_that_was_cut_off_is_written_anew(path):
     written(path, [])
     header = path.read_bytes()
     path.write_bytes(header[:20])
@@ -277,8 +271,7 @@ def test_a_header_that_was_cut_off_is_written_anew(tmp_path):
 @pytest.mark.parametrize(
     'content', ['q1,q2,q3,x,y,z\n1,2,3,4,5,6', 'notes of mine', 'q1\n', 'x' * 100_000]
 )
-def test_a_file_that_is_no_journal_is_refused_and_left_as_it_is(tmp_path, content):
-    path = tmp_path / 'cell.csv'
+def test_a_file_that_is_no_journal_is_refused_and_left_as_it_is(path, content):
     path.write_text(content)
     with pytest.raises(InputError, match="lacks this robot's columns"):
         Journal(path, JOINTS)
@@ -286,8 +279,7 @@ def test_a_file_that_is_no_journal_is_refused_and_left_as_it_is(tmp_path, conten
 
 
 @pytest.mark.parametrize(('mark', 'end'), [(b'\xef\xbb\xbf', b'\n'), (b'', b'\r\n')])
-def test_a_journal_that_a_spreadsheet_saved_is_refused_for_that(tmp_path, mark, end):
-    path = tmp_path / 'cell.csv'
+def test_a_journal_that_a_spreadsheet_saved_is_refused_for_that(path, mark, end):
     written(path, [plain(1)])
     content = mark + path.read_bytes().replace(b'\n', end)
     path.write_bytes(content)
@@ -298,8 +290,7 @@ def test_a_journal_that_a_spreadsheet_saved_is_refused_for_that(tmp_path, mark, 
 
 
 @pytest.mark.parametrize('tail', [b'', b'1,2', b'\0' * 10, b'\0' * 200_000])
-def test_what_a_crash_left_behind_the_last_row_is_cut_off(tmp_path, tail):
-    path = tmp_path / 'cell.csv'
+def test_what_a_crash_left_behind_the_last_row_is_cut_off(path, tail):
     Journal(path, JOINTS).close()
     rows = path.read_bytes() + b'1,2,3\n' * 20_000
     path.write_bytes(rows + tail)

@@ -127,8 +127,7 @@ def test_what_is_no_expression(text):
         (['0.1', '-2', '3', '4e-5', '5'], '--columns "q1=#1,q2=#2,x=#3,y=#4,z=#5", in its order'),
     ],
 )
-def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, names, proposed):
-    path = tmp_path / 'cell.csv'
+def test_columns_of_other_names_are_proposed_as_they_can_be_given(path, names, proposed):
     path.write_text(text_of(JOINTS, *[PLACES] * ((len(names) - 2) // 3), names=names))
     joints = tuple(Joint(name, a=0.3) for name in ('shoulder', 'elbow'))
     with pytest.raises(InputError) as told:
@@ -148,8 +147,7 @@ def test_a_quaternion_in_place_of_the_joints_is_told(tmp_path, given, told):
     assert (text in str(refused.value)) is told
 
 
-def test_a_linear_axis_has_its_own_unit_in_the_header(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_a_linear_axis_has_its_own_unit_in_the_header(path):
     path.write_text('rail [mm],turn [°],X [mm],Y [mm],Z [mm]\n1500,90,1,2,3\n')
     chain = Chain('arm', 'standard', (Joint('rail', type='prismatic'), Joint('turn', a=0.3)))
     (found,) = loading.table(path, chain, Settings()).fitted
@@ -260,8 +258,7 @@ def test_a_line_of_units_below_our_own_columns_is_read(tmp_path):
         read_table(tmp_path / 'cell.csv', 2)
 
 
-def test_units_of_standard_deviations_and_of_converted_columns(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_units_of_standard_deviations_and_of_converted_columns(path):
     path.write_text('q1,q2,X [mm],y,z,sx [um],sy [um],sz [um]\n1,2,3,4,5,10,10,10\n')
     table = read_table(path, 2, foreign=Foreign(Layout(columns={'x': 'X/1000'})))
     np.testing.assert_allclose(np.diag(table.fitted[0].covariance[0])[:3], 1e-10)
@@ -366,11 +363,8 @@ def test_a_column_of_targets_that_was_given_is_read_beside_one_of_poses(tmp_path
 
 
 @pytest.mark.parametrize(('names', 'refused'), [('q1,q2,x,y,z', True), (None, False)])
-def test_lines_of_several_units_are_refused_unless_each_column_has_its_own(
-    tmp_path, names, refused
-):
+def test_lines_of_several_units_are_refused_unless_each_column_has_its_own(path, names, refused):
     """Two files in one were read in the units of the first."""
-    path = tmp_path / 'cell.csv'
     units = 'q1 [rad],q2 [rad],x [m],y [m],z [m]'
     path.write_text(f'Units: mm\n{names or units}\n0,0,1,2,3\n0,1,1,2,4\nUnits: m\n1,0,2,3,4\n')
     if refused:

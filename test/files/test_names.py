@@ -47,9 +47,8 @@ def test_columns_of_a_table_without_a_header_are_proposed_by_their_numbers(tmp_p
 
 
 @pytest.mark.parametrize('header', ['Q1,Q2,X,Y,Z', 'Shoulder [rad],elbow,X [m],Y [m],z [m]'])
-def test_options_may_use_our_names_for_columns_that_need_none(tmp_path, header):
+def test_options_may_use_our_names_for_columns_that_need_none(path, header):
     """As messages about mistakes propose them: the table was said to have no column q1 or y."""
-    path = tmp_path / 'cell.csv'
     path.write_text('a title\n' + header + PLAIN[PLAIN.index('\n') :])
     found, *_ = read(path, preset='', columns=['q1=q2,q2=-q1,y=2*y'], given={}).fitted
     np.testing.assert_allclose(found.joints, JOINTS[:, ::-1] * [1, -1])
@@ -100,9 +99,8 @@ def proposed(path, said='.*'):
     ],
 )
 @pytest.mark.parametrize('joints', [['q1', 'q2'], ['J1', 'J2']])
-def test_nominal_coordinates_are_never_taken_for_measured_ones(tmp_path, first, second, joints):
+def test_nominal_coordinates_are_never_taken_for_measured_ones(path, first, second, joints):
     """Plain names beside measured ones were, without a word."""
-    path = tmp_path / 'cell.csv'
     header = [*joints, *names(first), *names(second)]
     path.write_text(text_of(JOINTS, NOMINAL, PLACES, names=header))
     assert_same(proposed(path), None)
@@ -116,8 +114,7 @@ def test_nominal_coordinates_alone_are_not_proposed(guessed, form):
         guessed(text_of(JOINTS, NOMINAL, names=['q1', 'q2', *names(form)]))
 
 
-def test_deviations_tell_that_plain_coordinates_may_be_nominal(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_deviations_tell_that_plain_coordinates_may_be_nominal(path):
     columns = JOINTS, NOMINAL, PLACES - NOMINAL
     path.write_text(text_of(*columns, names=[*NAMES, 'dx', 'dy', 'dz']))
     assert_same(proposed(path, '"x=x,y=y,z=z" if they were measured'), None)
@@ -134,9 +131,8 @@ def test_deviations_tell_that_plain_coordinates_may_be_nominal(tmp_path):
 
 @pytest.mark.parametrize('form', ['{}_corr', '{}_t', '{}_flange', '{} (2)', 'Corrected {}'])
 @pytest.mark.parametrize('ours', [NAMES[2:], ['X', 'Y', 'Z']])
-def test_plain_coordinates_may_be_nominal_beside_any_others(guessed, tmp_path, form, ours):
+def test_plain_coordinates_may_be_nominal_beside_any_others(guessed, path, form, ours):
     """They were read, with a note that the others were not."""
-    path = tmp_path / 'cell.csv'
     given = [*NAMES[:2], *ours, *names(form)]
     path.write_text(text_of(JOINTS, NOMINAL, PLACES, names=given))
     assert_same(proposed(path, 'if they were measured'), None)
@@ -181,17 +177,15 @@ def test_plain_coordinates_may_be_nominal_beside_any_others(guessed, tmp_path, f
         ('coppia{}', 'asse{}'),
     ],
 )
-def test_other_values_are_not_taken_for_measured_joints(tmp_path, first, second):
-    path = tmp_path / 'cell.csv'
+def test_other_values_are_not_taken_for_measured_joints(path, first, second):
     given = [form.format(k) for form in (first, second) for k in (1, 2)]
     path.write_text(text_of(JOINTS + 0.01, JOINTS, PLACES, names=[*given, *NAMES[2:]]))
     assert_same(proposed(path), None)
 
 
 @pytest.mark.parametrize('names', [('q1', 'q2'), ('x', 'y', 'z')])
-def test_names_in_capitals_beside_small_ones_are_in_doubt(tmp_path, names):
+def test_names_in_capitals_beside_small_ones_are_in_doubt(path, names):
     """The small ones were read, with a note that the others were not."""
-    path = tmp_path / 'cell.csv'
     right = JOINTS if names[0] == 'q1' else PLACES
     given = [*NAMES, *map(str.upper, names)]
     wrong = [each + 0.01 if each is right else each for each in (JOINTS, PLACES)]
@@ -220,9 +214,8 @@ def test_other_values_are_never_proposed_for_joints(guessed, form):
 
 
 @pytest.mark.parametrize('form', ['quat_{}', 'Quat {}', 'q_{}', 'orientation.{}', 'rot_{}'])
-def test_quaternions_are_read_by_their_names(tmp_path, form):
+def test_quaternions_are_read_by_their_names(path, form):
     """They were left out with a note."""
-    path = tmp_path / 'cell.csv'
     given = [*NAMES, *(form.format(axis) for axis in 'xyzw')]
     path.write_text(text_of(JOINTS, PLACES, QUATERNIONS, names=given))
     for foreign in (None, Foreign(Layout(), ARM)):
@@ -236,8 +229,7 @@ def test_quaternions_are_read_by_their_names(tmp_path, form):
 
 
 @pytest.mark.parametrize('prefix', ['pose.', '/leica/long/name/of/the/topic/pose/'])
-def test_a_pose_of_ros_is_proposed(tmp_path, prefix):
-    path = tmp_path / 'cell.csv'
+def test_a_pose_of_ros_is_proposed(path, prefix):
     given = [f'/joint_states/{joint}/position' for joint in ARM.joint_names]
     given += [f'{prefix}position.{axis}' for axis in 'xyz']
     given += [f'{prefix}orientation.{axis}' for axis in 'xyzw']
@@ -269,8 +261,7 @@ def test_a_homogeneous_matrix_is_proposed(tmp_path, form, first):
         ('W,P,R', 'rx=W,ry=P,rz=R" --euler xyz'),
     ],
 )
-def test_the_option_for_angles_is_told(tmp_path, angles, option):
-    path = tmp_path / 'cell.csv'
+def test_the_option_for_angles_is_told(path, angles, option):
     given = [*NAMES, *angles.split(',')]
     unit = 180 / np.pi if 'deg' in angles else 1.0
     turned = TURNED.as_euler(option[-3:]) * unit
@@ -282,9 +273,8 @@ def test_the_option_for_angles_is_told(tmp_path, angles, option):
     )
 
 
-def test_angles_named_by_their_axes_may_be_in_the_order_of_the_letters(tmp_path):
+def test_angles_named_by_their_axes_may_be_in_the_order_of_the_letters(path):
     """As a message about mistakes proposes; with rx, ry, rz beside them it could not be done."""
-    path = tmp_path / 'cell.csv'
     path.write_text(text_of(JOINTS, PLACES, TURNED.as_euler('ZYX'), names=[*NAMES, *TURNS]))
     assert_same(
         read(path, preset='', columns=['r1=rx,r2=ry,r3=rz'], given={'euler': 'ZYX'}), TURNED
@@ -312,16 +302,14 @@ def test_five_numbered_columns_are_no_quaternion(tmp_path):
     assert [*turns_in(tmp_path, numbered[:4])]
 
 
-def test_numbers_as_names_of_columns_are_no_values(tmp_path):
+def test_numbers_as_names_of_columns_are_no_values(path):
     """The proposal q*=* gave the joints 1, 2 ... as constants."""
-    path = tmp_path / 'cell.csv'
     path.write_text(text_of(JOINTS, PLACES, names=['1', '2', 'x', 'y', 'z']))
     assert_same(proposed(path), None)
 
 
-def test_another_form_of_rotations_replaces_the_columns_of_a_preset(tmp_path):
+def test_another_form_of_rotations_replaces_the_columns_of_a_preset(path):
     """`--preset vicon --rotation-vector` missed the column RW."""
-    path = tmp_path / 'cell.csv'
     given = ['A1', 'A2', 'RX', 'RY', 'RZ', 'TX', 'TY', 'TZ']
     path.write_text(text_of(JOINTS, TURNED.as_rotvec(), PLACES, names=given))
     units = {'length': 'm', 'rotation_vector': True}
@@ -349,16 +337,14 @@ def test_touched_places_are_read_as_other_tables_are(tmp_path, text):
             np.testing.assert_array_equal(one.joints, same.joints)
 
 
-def test_a_location_may_be_anything(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_a_location_may_be_anything(path):
     lines = PLAIN.splitlines()
     path.write_text('\n'.join([f'{lines[0]},Location', *(f'{each},hall 2' for each in lines[1:])]))
     assert_same(read_table(path, 2, foreign=Foreign(Layout())), None)
 
 
 @pytest.mark.parametrize('name', ['Length [m]', 'Distance to anchor', 'wire (m)'])
-def test_a_distance_is_proposed(guessed, tmp_path, name):
-    path = tmp_path / 'cell.csv'
+def test_a_distance_is_proposed(guessed, path, name):
     path.write_text(text_of(JOINTS, PLACES[:, 0], names=['J1', 'J2', name]))
     (found,) = proposed(path).fitted
     np.testing.assert_allclose(found.distances, PLACES[:, 0])
@@ -373,9 +359,8 @@ def test_numbered_columns_of_a_preset_are_of_its_own_form(tmp_path):
 
 
 @pytest.mark.parametrize(('unit', 'size'), [('in', 0.0254), ('ft', 0.3048)])
-def test_a_unit_that_may_be_a_word_is_proposed(tmp_path, unit, size):
+def test_a_unit_that_may_be_a_word_is_proposed(path, unit, size):
     """X_in was proposed as metres."""
-    path = tmp_path / 'cell.csv'
     path.write_text(text_of(JOINTS, PLACES / size, names=['q1', 'q2', *names(f'{{}}_{unit}')]))
     option = f'x=X_{unit},y=Y_{unit},z=Z_{unit}'
     with pytest.raises(InputError, match=f'--columns "{option}" --length {unit}'):

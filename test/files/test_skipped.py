@@ -48,8 +48,7 @@ def tables(path):
         ('Mean of all points,0.1,0.2,0.3,0.4,0.5', 'Std.-Abw.,1,1,1,1,1'),
     ],
 )
-def test_statistics_below_a_table_are_no_poses(tmp_path, rows):
-    path = tmp_path / 'cell.csv'
+def test_statistics_below_a_table_are_no_poses(path, rows):
     path.write_text(NAMED + '\n'.join(rows) + '\n')
     for table in tables(path):
         assert_same(table, None)
@@ -57,9 +56,8 @@ def test_statistics_below_a_table_are_no_poses(tmp_path, rows):
 
 
 @pytest.mark.parametrize(('yes', 'no'), [('1', '0'), ('True', 'False'), ('y', 'n')])
-def test_rows_that_a_column_calls_invalid_are_left_out(tmp_path, yes, no):
+def test_rows_that_a_column_calls_invalid_are_left_out(path, yes, no):
     """They were outliers: some trackers repeat the last position while the target is hidden."""
-    path = tmp_path / 'cell.csv'
     first, *lines = PLAIN.splitlines()
     rows = [*(f'{line},{yes}' for line in lines), f'0.1,0.2,0.3,0.4,0.5,{no}']
     path.write_text('\n'.join([f'{first},valid', *rows, '']))
@@ -69,9 +67,8 @@ def test_rows_that_a_column_calls_invalid_are_left_out(tmp_path, yes, no):
         assert [note for note in table.warnings if 'valid' in note] == [told]
 
 
-def test_words_of_a_column_valid_are_told_if_unknown_and_all_are_not_left_out(tmp_path):
+def test_words_of_a_column_valid_are_told_if_unknown_and_all_are_not_left_out(path):
     """They were read without a word, or a table needed x, y, z that it has."""
-    path = tmp_path / 'cell.csv'
     first, *lines = PLAIN.splitlines()
     for said in ('1', 'NOK', '0'):
         path.write_text('\n'.join([f'{first},valid', *(f'{line},{said}' for line in lines), '']))
@@ -99,9 +96,8 @@ SUMMARIES = {
 
 @pytest.mark.parametrize('kinds', SUMMARIES)
 @pytest.mark.parametrize('above', [False, True])
-def test_rows_computed_of_all_others_are_no_poses(tmp_path, kinds, above):
+def test_rows_computed_of_all_others_are_no_poses(path, kinds, above):
     """Without a name they were outliers, and told as what moved."""
-    path = tmp_path / 'cell.csv'
     more = [kind(MANY, axis=0).round(4) for kind in SUMMARIES[kinds]]
     path.write_text(text_of(np.vstack([*more, MANY] if above else [MANY, *more]), names=NAMES))
     for table in tables(path):
@@ -109,9 +105,8 @@ def test_rows_computed_of_all_others_are_no_poses(tmp_path, kinds, above):
         assert any(f'of all others in line{"s" * (len(more) > 1)}' in w for w in table.warnings)
 
 
-def test_poses_that_are_hardly_computed_are_kept(tmp_path):
+def test_poses_that_are_hardly_computed_are_kept(path):
     """A pose in the middle of the others has another measured place; repeats have one."""
-    path = tmp_path / 'cell.csv'
     middle = np.array([*MANY[:, :2].mean(axis=0), *MANY[:, 2:].mean(axis=0) + 1e-3])
     again = np.tile(MANY[:1], (8, 1))
     again[::2, 2:] += 2e-5
@@ -122,9 +117,8 @@ def test_poses_that_are_hardly_computed_are_kept(tmp_path):
             assert len(table.fitted[0]) == len(rows)
 
 
-def test_statistics_without_a_table_are_refused(tmp_path):
+def test_statistics_without_a_table_are_refused(path):
     """Of stamps it was an IndexError."""
-    path = tmp_path / 'cell.csv'
     path.write_text('point,time,q1,q2,x,y,z\nmean,1,0.1,0.2,0.3,0.4,0.5\n')
     for foreign in (None, Foreign(Layout(), ARM)):
         with pytest.raises(InputError, match='no rows'):
@@ -132,9 +126,8 @@ def test_statistics_without_a_table_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize('place', [1, 2, 3])
-def test_means_between_poses_are_no_poses(tmp_path, place):
+def test_means_between_poses_are_no_poses(path, place):
     """Of each group of measurements, and what stands beside them; they were read as poses."""
-    path = tmp_path / 'cell.csv'
     lines = NAMED.splitlines()
     lines.insert(place, 'Average:,0.1,0.2,0.3,0.4,0.5\nStd. Dev.,1,1,1,1,1')
     lines.append('P2 Average,0.1,0.2,0.3,0.4,0.5\nmax,1,1,1,1,1')
@@ -159,15 +152,13 @@ def test_means_between_poses_are_no_poses(tmp_path, place):
         ('alta', 'media', 'bassa'),
     ],
 )
-def test_poses_with_such_names_are_kept(tmp_path, names):
-    path = tmp_path / 'cell.csv'
+def test_poses_with_such_names_are_kept(path, names):
     path.write_text(NAMED.replace('\np,', '\n{},').format(*names, *'pp'))
     for table in tables(path):
         assert_same(table, None)
 
 
-def test_poses_may_be_means_with_their_deviations(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_poses_may_be_means_with_their_deviations(path):
     head, *poses = NAMED.splitlines()
     rows = [f'P{k} mean{each[1:]}\nP{k} std,0,0,1,2,3' for k, each in enumerate(poses)]
     path.write_text('\n'.join([head, *rows]) + '\n')
@@ -176,16 +167,14 @@ def test_poses_may_be_means_with_their_deviations(tmp_path):
 
 
 @pytest.mark.parametrize('count', [1, 3])
-def test_a_name_that_comes_again_or_before_others_is_no_statistic(tmp_path, count):
-    path = tmp_path / 'cell.csv'
+def test_a_name_that_comes_again_or_before_others_is_no_statistic(path, count):
     path.write_text(NAMED.replace('\np,', '\nmax,', count))
     for table in tables(path):
         assert_same(table, None)
 
 
 @pytest.mark.parametrize('lost', ['0', '0.000', '-9999', '-9999.0', '99999', '-99999,'])
-def test_a_lost_target_is_no_position(tmp_path, lost):
-    path = tmp_path / 'cell.csv'
+def test_a_lost_target_is_no_position(path, lost):
     semicolons = lost.endswith(',')
     text = f'{PLAIN}0.2,0.3,' + ','.join([lost.rstrip(',')] * 3) + '\n'
     path.write_text(text.replace(',', ';') if semicolons else text)
@@ -199,9 +188,8 @@ def test_a_lost_target_is_no_position(tmp_path, lost):
         read_table(path, 2)
 
 
-def test_joint_values_and_measurements_in_rows_of_their_own_are_told(tmp_path):
+def test_joint_values_and_measurements_in_rows_of_their_own_are_told(path):
     """As two recordings merged by time are written."""
-    path = tmp_path / 'cell.csv'
     rows = ''.join(f'{k},0.{k},0.2,,,\n{k}.5,,,1,2,3\n' for k in range(4))
     path.write_text(f'stamp,q1,q2,x,y,z\n{rows}')
     for foreign in (None, Foreign(Layout(), ARM)):
@@ -209,8 +197,7 @@ def test_joint_values_and_measurements_in_rows_of_their_own_are_told(tmp_path):
             read_table(path, 2, foreign=foreign)
 
 
-def test_lost_targets_are_known_in_any_unit(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_lost_targets_are_known_in_any_unit(path):
     path.write_text(f'{PLAIN}0.2,0.3,-9999,-9999,-9999\n'.replace('x,y,z', 'x [mm],y [mm],z [mm]'))
     (found,) = read_table(path, 2, foreign=Foreign(Layout())).fitted
     assert len(found) == 3
@@ -232,9 +219,8 @@ def test_lost_targets_are_known_in_any_unit(tmp_path):
     ],
 )
 @pytest.mark.parametrize('place', [2, 3])
-def test_remarks_and_headers_again_are_no_rows(tmp_path, row, place):
+def test_remarks_and_headers_again_are_no_rows(path, row, place):
     """Each was refused, as a value that is no number."""
-    path = tmp_path / 'cell.csv'
     lines = PLAIN.replace('z\n', 'z\nrad,rad,m,m,m\n', 1).splitlines()
     lines.insert(place + 2, row)
     path.write_text('\n'.join(lines) + '\n')
@@ -243,9 +229,8 @@ def test_remarks_and_headers_again_are_no_rows(tmp_path, row, place):
         assert any(f'line {place + 3}' in note for note in table.warnings)
 
 
-def test_remarks_below_names_of_poses_are_no_rows(guessed, tmp_path):
+def test_remarks_below_names_of_poses_are_no_rows(guessed, path):
     """Between commas they were refused: q1 was empty. Values that were cut off still are."""
-    path = tmp_path / 'cell.csv'
     for row in ('moved the target', '# end', 'nominal load'):
         path.write_text(f'{NAMED}{row}\n')
         for table in tables(path):
@@ -274,9 +259,8 @@ def test_remarks_below_names_of_poses_are_no_rows(guessed, tmp_path):
         (('', 'Theo'), ''),
     ],
 )
-def test_rows_below_a_title_that_calls_them_nominal_are_refused(tmp_path, titles, said, again):
+def test_rows_below_a_title_that_calls_them_nominal_are_refused(path, titles, said, again):
     """A table of nominal poses below the measured ones was read as more of these."""
-    path = tmp_path / 'cell.csv'
     first, second = (f'{title}\n' * bool(title) for title in titles)
     rows = PLAIN.partition('\n')[2].replace('0.25', '0.26')
     path.write_text(f'{first}{PLAIN}{second}{again}{rows}')
@@ -340,8 +324,7 @@ def test_between_blanks_a_line_of_units_has_a_cell_for_each_name(tmp_path):
 
 
 @pytest.mark.parametrize('cell', ['---', '***', '#VALUE!', '1.#QNAN', '-nan(ind)', 'lost', 'n.a.'])
-def test_cells_without_a_value_are_empty(tmp_path, cell):
-    path = tmp_path / 'cell.csv'
+def test_cells_without_a_value_are_empty(path, cell):
     path.write_text(f'{PLAIN}0.2,0.3,{cell},{cell},{cell}\n')
     for table in tables(path):
         assert_same(table, None)

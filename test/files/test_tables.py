@@ -73,10 +73,7 @@ LEFT_OUT = 'it has no q3 (q3): left out'
     ],
     ids=['too many joints', 'commented out', 'units above', 'converted', 'a long title'],
 )
-def test_what_stands_beside_the_numbers_of_others_is_told_or_ignored(
-    tmp_path, text, layout, x, said
-):
-    path = tmp_path / 'cell.csv'
+def test_what_stands_beside_the_numbers_of_others_is_told_or_ignored(path, text, layout, x, said):
     path.write_text(text)
     table = read_table(path, 2, foreign=Foreign(Layout(**layout)))
     assert table.fitted[0].positions[:, 0].tolist() == [x, 4.5 * x]
@@ -107,8 +104,7 @@ B,left,map,6,0,6,0,0,
 """
 
 
-def test_each_device_and_session_has_a_frame_of_its_own(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_each_device_and_session_has_a_frame_of_its_own(path):
     path.write_text(FRAMES.replace('A,left,map', 'A,other,map'))
     table = read_table(path, 2, ('A', 'B'))
     assert [each.base for each in table.fitted] == ['base', 'base_right', 'base_other', 'base_B']
@@ -210,9 +206,8 @@ MIXED = (
 )  # fmt: skip
 
 
-def test_rows_of_several_kinds_are_sets_between_frames_of_their_own(tmp_path):
+def test_rows_of_several_kinds_are_sets_between_frames_of_their_own(path):
     """Positions, a distance and a pose in a camera on the flange, and one pose held out."""
-    path = tmp_path / 'cell.csv'
     path.write_text(MIXED)
     table = read_table(path, 2)
     points, wire, camera, judge = found = (*table.fitted, *table.held_out)
@@ -229,8 +224,7 @@ def test_rows_of_several_kinds_are_sets_between_frames_of_their_own(tmp_path):
     assert [each.distances for each in (points, camera, judge)] == [None] * 3
 
 
-def test_sessions_come_in_the_order_asked_for(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_sessions_come_in_the_order_asked_for(path):
     path.write_text(SESSIONS)
     found = read_table(path, 2, ('B', 'A')).fitted
     assert [each.positions[:, 0].tolist() for each in found] == [[2.0], [1.0, 3.0]]
@@ -253,8 +247,7 @@ def test_sessions_come_in_the_order_asked_for(tmp_path):
         ('q1,q2,x,y,z,q_w,,robot\n0,0,1,2,3,1,,left\n', 'columns not read: q_w, robot ('),
     ],
 )
-def test_columns_that_someone_may_have_wanted_are_told(tmp_path, text, said):
-    path = tmp_path / 'cell.csv'
+def test_columns_that_someone_may_have_wanted_are_told(path, text, said):
     path.write_text(text)
     warnings = read_table(path, 2).warnings
     assert len(warnings) == bool(said) * (4 if 'QX' in text else 1)
@@ -273,9 +266,8 @@ def test_columns_that_someone_may_have_wanted_are_told(tmp_path, text, said):
     ],
 )
 def test_without_options_a_table_of_others_is_read_as_far_as_it_can_be_guessed(
-    tmp_path, names, separator, noted
+    path, names, separator, noted
 ):
-    path = tmp_path / 'cell.csv'
     text = POINTS.replace('q1,q2,x,y,z', names).replace(',', separator)
     path.write_bytes(text.encode('utf-16' if 'UTF-16' in names else 'cp1252'))
     joints = tuple(Joint(name, a=0.3) for name in ('shoulder', 'elbow'))
@@ -296,8 +288,7 @@ def test_a_pipe_in_another_form_is_told_to_be_saved():
 
 
 @pytest.mark.parametrize('name', ['Session', 'SESSION', 'session'])
-def test_columns_of_names_are_read_in_any_case(tmp_path, name):
-    path = tmp_path / 'cell.csv'
+def test_columns_of_names_are_read_in_any_case(path, name):
     path.write_text(SESSIONS.replace('session', name))
     with pytest.raises(InputError, match=r'several sessions, choose one of A, B .* together\)$'):
         read_table(path, 2)
@@ -306,8 +297,7 @@ def test_columns_of_names_are_read_in_any_case(tmp_path, name):
         read_table(path, 2)
 
 
-def test_a_name_in_another_case_is_told_and_two_are_not_read(tmp_path):
-    path = tmp_path / 'cell.csv'
+def test_a_name_in_another_case_is_told_and_two_are_not_read(path):
     path.write_text('q1,q2,x,y,z,Target\n0,0,1,2,3,a\n')
     assert read_table(path, 2).warnings == (f'{path}: the column Target is read as target',)
     path.write_text('q1,q2,x,y,z,Target,TARGET\n0,0,1,2,3,a,b\n')
@@ -315,9 +305,8 @@ def test_a_name_in_another_case_is_told_and_two_are_not_read(tmp_path):
 
 
 @pytest.mark.parametrize('column', ['distance', 'Distance [mm]', 'plane'])
-def test_distances_beside_coordinates_are_no_measurements_of_their_own(tmp_path, column):
+def test_distances_beside_coordinates_are_no_measurements_of_their_own(path, column):
     """As trackers write them; the column had to be renamed."""
-    path = tmp_path / 'cell.csv'
     path.write_text(f'q1;q2;x;y;z;{column}\n0,1;0;1;2;3;4\n0,2;0;1;2;3;\n')
     arm = Chain('arm', 'standard', (Joint('a'), Joint('b')))
     table = loading.table(path, arm, Settings())
@@ -330,9 +319,8 @@ def test_distances_beside_coordinates_are_no_measurements_of_their_own(tmp_path,
 
 
 @pytest.mark.parametrize('separator', [',', ';'])
-def test_a_name_of_poses_is_no_target(tmp_path, separator):
+def test_a_name_of_poses_is_no_target(path, separator):
     """SpatialAnalyzer calls a point so: each row had a frame of its own to be fitted."""
-    path = tmp_path / 'cell.csv'
     rows = [f'{k}e-1,0,1,2,3,P{k}' for k in range(4)]
     path.write_text('\n'.join(['q1,q2,x,y,z,Target', *rows, '']).replace(',', separator))
     arm = Chain('arm', 'standard', (Joint('a'), Joint('b')))
