@@ -18,8 +18,9 @@ ARM = Chain('arm', 'standard', (Joint('a'), Joint('b')))
 NAMED = PLAIN.replace('q1', 'point,q1', 1).replace('\n', '\np,', 3)
 
 
-def tables(path):
-    """Yield the table read as ours, as that of another system, and either."""
+def tables(path, text):
+    """Yield the table of a text as the command line reads it, and as that of another system."""
+    path.write_text(text)
     yield loading.table(path, ARM, Settings())
     yield read_table(path, 2, foreign=Foreign(Layout(), ARM))
 
@@ -49,8 +50,7 @@ def tables(path):
     ],
 )
 def test_statistics_below_a_table_are_no_poses(path, rows):
-    path.write_text(NAMED + '\n'.join(rows) + '\n')
-    for table in tables(path):
+    for table in tables(path, NAMED + '\n'.join(rows) + '\n'):
         assert_same(table, None)
         assert any(note.startswith(f'{path}: statistics in line') for note in table.warnings)
 
@@ -60,8 +60,7 @@ def test_rows_that_a_column_calls_invalid_are_left_out(path, yes, no):
     """They were outliers: some trackers repeat the last position while the target is hidden."""
     first, *lines = PLAIN.splitlines()
     rows = [*(f'{line},{yes}' for line in lines), f'0.1,0.2,0.3,0.4,0.5,{no}']
-    path.write_text('\n'.join([f'{first},valid', *rows, '']))
-    for table in tables(path):
+    for table in tables(path, '\n'.join([f'{first},valid', *rows, ''])):
         assert_same(table, None)
         told = f'{path}: the column valid says no in line 5: skipped'
         assert [note for note in table.warnings if 'valid' in note] == [told]
@@ -71,12 +70,12 @@ def test_words_of_a_column_valid_are_told_if_unknown_and_all_are_not_left_out(pa
     """They were read without a word, or a table needed x, y, z that it has."""
     first, *lines = PLAIN.splitlines()
     for said in ('1', 'NOK', '0'):
-        path.write_text('\n'.join([f'{first},valid', *(f'{line},{said}' for line in lines), '']))
+        text = '\n'.join([f'{first},valid', *(f'{line},{said}' for line in lines), ''])
         if said == '0':
             with pytest.raises(InputError, match='rename it if it means something else'):
-                next(tables(path))
+                next(tables(path, text))
             continue
-        for table in tables(path):
+        for table in tables(path, text):
             assert_same(table, None)
             told = [note for note in table.warnings if 'column valid' in note]
             assert len(told) == (said == 'NOK')
@@ -99,8 +98,8 @@ SUMMARIES = {
 def test_rows_computed_of_all_others_are_no_poses(path, kinds, above):
     """Without a name they were outliers, and told as what moved."""
     more = [kind(MANY, axis=0).round(4) for kind in SUMMARIES[kinds]]
-    path.write_text(text_of(np.vstack([*more, MANY] if above else [MANY, *more]), names=NAMES))
-    for table in tables(path):
+    text = text_of(np.vstack([*more, MANY] if above else [MANY, *more]), names=NAMES)
+    for table in tables(path, text):
         np.testing.assert_allclose(table.fitted[0].positions, MANY[:, 2:], atol=1e-12)
         assert any(f'of all others in line{"s" * (len(more) > 1)}' in w for w in table.warnings)
 
@@ -112,8 +111,7 @@ def test_poses_that_are_hardly_computed_are_kept(path):
     again[::2, 2:] += 2e-5
     again[-1, 2:] += 1e-5
     for rows in (np.vstack([MANY, middle]), again, np.vstack([MANY, MANY])):
-        path.write_text(text_of(rows, names=NAMES))
-        for table in tables(path):
+        for table in tables(path, text_of(rows, names=NAMES)):
             assert len(table.fitted[0]) == len(rows)
 
 
@@ -132,8 +130,7 @@ def test_means_between_poses_are_no_poses(path, place):
     lines.insert(place, 'Average:,0.1,0.2,0.3,0.4,0.5\nStd. Dev.,1,1,1,1,1')
     lines.append('P2 Average,0.1,0.2,0.3,0.4,0.5\nmax,1,1,1,1,1')
     for text in ('\n'.join(lines), '\n'.join(lines[:-1])):
-        path.write_text(text + '\n')
-        for table in tables(path):
+        for table in tables(path, text + '\n'):
             assert_same(table, None)
 
 
@@ -153,23 +150,20 @@ def test_means_between_poses_are_no_poses(path, place):
     ],
 )
 def test_poses_with_such_names_are_kept(path, names):
-    path.write_text(NAMED.replace('\np,', '\n{},').format(*names, *'pp'))
-    for table in tables(path):
+    for table in tables(path, NAMED.replace('\np,', '\n{},').format(*names, *'pp')):
         assert_same(table, None)
 
 
 def test_poses_may_be_means_with_their_deviations(path):
     head, *poses = NAMED.splitlines()
     rows = [f'P{k} mean{each[1:]}\nP{k} std,0,0,1,2,3' for k, each in enumerate(poses)]
-    path.write_text('\n'.join([head, *rows]) + '\n')
-    for table in tables(path):
+    for table in tables(path, '\n'.join([head, *rows]) + '\n'):
         assert_same(table, None)
 
 
 @pytest.mark.parametrize('count', [1, 3])
 def test_a_name_that_comes_again_or_before_others_is_no_statistic(path, count):
-    path.write_text(NAMED.replace('\np,', '\nmax,', count))
-    for table in tables(path):
+    for table in tables(path, NAMED.replace('\np,', '\nmax,', count)):
         assert_same(table, None)
 
 
@@ -177,8 +171,7 @@ def test_a_name_that_comes_again_or_before_others_is_no_statistic(path, count):
 def test_a_lost_target_is_no_position(path, lost):
     semicolons = lost.endswith(',')
     text = f'{PLAIN}0.2,0.3,' + ','.join([lost.rstrip(',')] * 3) + '\n'
-    path.write_text(text.replace(',', ';') if semicolons else text)
-    for table in tables(path):
+    for table in tables(path, text.replace(',', ';') if semicolons else text):
         assert_same(table, None)
         assert any('no target (x = y = z) in line 5' in note for note in table.warnings)
     path.write_text(f'{PLAIN}0.2,0.3,0.0,-9999,0.0\n')
@@ -223,8 +216,7 @@ def test_remarks_and_headers_again_are_no_rows(path, row, place):
     """Each was refused, as a value that is no number."""
     lines = PLAIN.replace('z\n', 'z\nrad,rad,m,m,m\n', 1).splitlines()
     lines.insert(place + 2, row)
-    path.write_text('\n'.join(lines) + '\n')
-    for table in tables(path):
+    for table in tables(path, '\n'.join(lines) + '\n'):
         assert_same(table, None)
         assert any(f'line {place + 3}' in note for note in table.warnings)
 
@@ -232,8 +224,7 @@ def test_remarks_and_headers_again_are_no_rows(path, row, place):
 def test_remarks_below_names_of_poses_are_no_rows(guessed, path):
     """Between commas they were refused: q1 was empty. Values that were cut off still are."""
     for row in ('moved the target', '# end', 'nominal load'):
-        path.write_text(f'{NAMED}{row}\n')
-        for table in tables(path):
+        for table in tables(path, f'{NAMED}{row}\n'):
             assert_same(table, None)
             assert any('line 5' in note for note in table.warnings)
     with pytest.raises(InputError, match='the rows below "Nominal" may be nominal'):
@@ -325,6 +316,5 @@ def test_between_blanks_a_line_of_units_has_a_cell_for_each_name(tmp_path):
 
 @pytest.mark.parametrize('cell', ['---', '***', '#VALUE!', '1.#QNAN', '-nan(ind)', 'lost', 'n.a.'])
 def test_cells_without_a_value_are_empty(path, cell):
-    path.write_text(f'{PLAIN}0.2,0.3,{cell},{cell},{cell}\n')
-    for table in tables(path):
+    for table in tables(path, f'{PLAIN}0.2,0.3,{cell},{cell},{cell}\n'):
         assert_same(table, None)
