@@ -16,17 +16,13 @@ storages, compressed and not. In each, side by side:
 factor it takes longer to replay.
 """
 
-import argparse
-import json
-import os
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 from peers import CACHE, environment, machine
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
@@ -182,12 +178,7 @@ def measured(path, large, count, other):
 
 def main():
     """Write the bags, read them and print what it took."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--minutes', type=float, default=10.0)
-    parser.add_argument('--environments', type=Path, default=CACHE)
-    parser.add_argument('--quick', action='store_true')
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(__doc__, minutes=10.0, environments=CACHE, quick=False, json=False)
     minutes = 0.5 if options.quick else options.minutes
     other = environment(options.environments, 'mcap-ros2-support', not options.quick)
     content = messages(minutes)
@@ -203,15 +194,8 @@ def main():
                     figures[f'{peer} / decoded'] = figures[peer] / figures['decoded']
             figures['foreign'] /= figures['decoded']
             found[kind] = figures
-    if options.json:
-        print(json.dumps({'machine': machine(), 'messages': len(content), 'bags': found}))
-        return
-    print(f'{machine()}; {len(content):,} messages, CPU time per message')
-    for kind, figures in found.items():
-        print(kind)
-        for name, value in figures.items():
-            unit = ' x' if name == 'foreign' or '/' in name else ' us'
-            print(f'    {name:30} {value:6.2f}{unit}')
+    found = {'machine': machine(), 'messages': len(content), 'bags': found}
+    bench.tell(found, options.json)
 
 
 if __name__ == '__main__':

@@ -13,6 +13,7 @@ and axes wobble: they tilt about x and y by amplitude sin(order q + phase).
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import bench
 import numpy as np
 import yaml
 from scipy.interpolate import CubicSpline
@@ -198,17 +199,12 @@ def misfit(wanted, rotation, position):
     return np.linalg.norm(error, axis=1)
 
 
-def rms(values):
-    """Return the root of the mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def resized(plain, wrong, what, size):
     """Return an arm with the field `what` scaled from that of `plain` to err by size [m]."""
     q = plain.draw(200, np.random.default_rng(0))
     own = getattr(wrong, what)
     for _ in range(2):  # nearly linear
-        factor = size / rms(misfit(wrong.forward(q)[1], *plain.forward(q)))
+        factor = size / bench.rms(misfit(wrong.forward(q)[1], *plain.forward(q)))
         if what == 'waves':
             own = tuple((order, factor * a, p) for order, a, p in own)
         else:
@@ -226,7 +222,7 @@ def bent(places, size, rng):
     powers = [x[:, i] * x[:, j] for i in range(3) for j in range(i, 3)]
     powers += [x[:, i] ** 2 * x[:, j] for i in range(3) for j in range(3)]
     error = np.array(powers).T @ rng.normal(size=(len(powers), 3))
-    return places + size * error / rms(np.linalg.norm(error, axis=1))
+    return places + size * error / bench.rms(np.linalg.norm(error, axis=1))
 
 
 def home_of(arm, rng, inner=0.6):

@@ -18,15 +18,11 @@ tells). Judged with the true arm by forward kinematics alone.
   same start, with the same forward kinematics and an analytic Jacobian, alternating with ours.
 """
 
-import argparse
-import json
-import os
 import statistics
 import time
 from dataclasses import replace
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 from scipy.optimize import least_squares, root
 
@@ -109,11 +105,9 @@ def timed(function, *arguments):
 
 def main():
     """Run everything and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--poses', type=int, default=10_000)
-    parser.add_argument('--quick', action='store_true', help='3 repetitions instead of 7')
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(
+        __doc__, poses=10_000, quick=(False, '3 repetitions instead of 7'), json=False
+    )
 
     rng = np.random.default_rng(0)
     nominal = load_chain('ur10e')
@@ -161,29 +155,7 @@ def main():
         'ratio': {name: rate['calib_ros'] / rate[name] for name in scipy},
     }
     document['true_model_max_um'] = document['true_model']['max_um']
-    if options.json:
-        print(json.dumps(document, indent=2))
-        return
-    print(f'{len(commands)} poses, refused: {document["refused"]}')
-    print(
-        f'  (of random configurations, singular ones included: '
-        f'{100 * document["refused_of_random"]:.1f} %)'
-    )
-    for label, row in (
-        ('before', document['before']),
-        ('true model', document['true_model']),
-        ('identified: before', document['identified']['before']),
-        ('identified: after', document['identified']['after']),
-        ('identified: floor', document['identified']['floor']),
-    ):
-        print(
-            f'{label:20} position max {row["max_um"]:10.4g} um, RMS {row["rms_um"]:10.4g} um; '
-            f'orientation max {row["max_urad"]:10.4g} urad'
-        )
-    for name, value in rate.items():
-        print(f'{name:15} {value:10.0f} poses/s')
-    ratios = ', '.join(f'{value:.0f} x {name}' for name, value in document['ratio'].items())
-    print(f'calib_ros is {ratios}')
+    bench.tell(document, options.json)
 
 
 if __name__ == '__main__':

@@ -14,14 +14,10 @@ Jacobian; a double holds 15.7.
     QR       triangular factor of the Jacobian itself
 """
 
-import argparse
-import json
-import os
 from dataclasses import replace
 from fractions import Fraction
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 from scipy import linalg
 
@@ -101,9 +97,7 @@ def digits(chain, joints, rng):
 
 def main():
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(__doc__, json=False)
     rng = np.random.default_rng(0)
     nominal = load_chain('ur10e')
     nominal = replace(nominal, base=Frame(), tool=Frame())
@@ -121,17 +115,7 @@ def main():
         'd instead of beta': digits(tilted, nominal.random_joints(200, rng), rng),
         'd instead of beta, 0.3 rad': digits(tilted, near(0.3), rng),
     }
-    if options.json:
-        print(json.dumps(figures))
-        return
-    ways = list(figures['the whole joint range']['digits'])
-    print(f'{"":28}{"P":>4}{"cond(J)":>10}{"scaled":>10}', *(f'{way:>9}' for way in ways))
-    for name, each in figures.items():
-        numbers = ' '.join(f'{each["digits"][way]:9.1f}' for way in ways)
-        print(
-            f'{name:28}{each["parameters"]:4}{each["condition"]:10.1e}'
-            f'{each["condition, scaled"]:10.1e} {numbers}'
-        )
+    bench.tell(figures, options.json)
 
 
 if __name__ == '__main__':

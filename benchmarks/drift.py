@@ -13,13 +13,10 @@ errors, on which `auto` chose an effect that is not there. `coverage_95`: how ma
 of their DH parameters hold the truth; `independent`: without regard to what neighbours share.
 """
 
-import argparse
 import json
-import os
 from dataclasses import replace
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 from scipy.signal import lfilter
 
@@ -81,11 +78,9 @@ def hits(true, result):
 
 def main():
     """Run all kinds of drift and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--runs', type=int, default=30)
-    parser.add_argument('--quick', action='store_true', help='a few runs, under a minute')
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(
+        __doc__, runs=30, quick=(False, 'a few runs, under a minute'), json=False
+    )
     runs = 4 if options.quick else options.runs
     nominal = load_chain('ur10e')
     rows = []

@@ -11,13 +11,9 @@ is the RMS position error at 1000 other poses over that of a fit of just the tru
 are arms with more than twice that, `false` those of a run without effects where one is chosen.
 """
 
-import argparse
-import os
 from dataclasses import replace
 
-os.environ.setdefault('OMP_NUM_THREADS', '1')
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 
 from calib_ros import Problem, identify, load_chain
@@ -50,17 +46,13 @@ def errors_of(number, bare=False):
     geometric, auto = identify(problem), identify_model(problem, 'auto')
     known = identify(replace(problem, effects=tuple(values)), geometric) if values else geometric
     unseen = chain.random_joints(1000, rng)
-    wanted = true.forward(unseen)[:, :3, 3]
-    found = [each.chain.forward(unseen)[:, :3, 3] - wanted for each in (geometric, auto, known)]
-    rms = [float(np.sqrt((each**2).sum(axis=1).mean())) for each in found]
-    return rms, auto.chain.effects
+    found = (bench.distances(each.chain, true, unseen) for each in (geometric, auto, known))
+    return [bench.rms(each) for each in found], auto.chain.effects
 
 
 def main():
     """Print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
-    parser.add_argument('--arms', type=int, default=60)
-    arms = parser.parse_args().arms
+    arms = bench.options(__doc__, arms=60).arms
     errors = np.array([errors_of(number)[0] for number in range(arms)])
     for name, column in zip(('geometric', 'auto'), errors.T, strict=False):
         ratio = column / errors[:, 2]

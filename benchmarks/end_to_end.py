@@ -10,16 +10,13 @@ table of positions (500,000 rows, --quick 50,000), a bag of stops (11,911, 1,000
 (9,528 poses, 1,000), `identify` of 500 poses in memory, and the demo.
 """
 
-import argparse
 import contextlib
 import io
 import json
-import os
 import tempfile
 from pathlib import Path
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 from peers import cpu, machine
 
@@ -91,10 +88,7 @@ def cases(folder, quick):
 
 def main():
     """Print a line for each case."""
-    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
-    parser.add_argument('--quick', action='store_true')
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(__doc__, quick=False, json=False)
     figures = []
     with tempfile.TemporaryDirectory() as name:
         command('demo', '--out', Path(name) / 'imports', '--force')

@@ -13,9 +13,7 @@ the machine can do. scheduler: its time and the client's for each task. kills: t
 worker, then the client is killed with SIGKILL; the history must hold each result once.
 """
 
-import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -27,8 +25,7 @@ from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
@@ -261,14 +258,15 @@ def until(predicate):
 
 def main():
     """Print what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
-    parser.add_argument('--quick', action='store_true', help='a few robots')
-    parser.add_argument('--json', action='store_true')
-    parser.add_argument('--part', choices=('nights', 'workers', 'scheduler', 'kills'))
-    parser.add_argument('--robots', type=int, help='for the nights')
-    parser.add_argument('--workers', type=int, default=0, help='for the nights')
-    parser.add_argument('--scheduler', default='', help='for the nights, from an archive by URL')
-    options = parser.parse_args()
+    options = bench.options(
+        __doc__,
+        quick=(False, 'a few robots'),
+        json=False,
+        part={'choices': ('nights', 'workers', 'scheduler', 'kills')},
+        robots=({'type': int}, 'for the nights'),
+        workers=(0, 'for the nights'),
+        scheduler=('', 'for the nights, from an archive by URL'),
+    )
     quick = options.quick
     robots, nights, bumped = (10, 8, 2) if quick else (200, 30, 5)
     parts = {
@@ -291,12 +289,7 @@ def main():
             with tempfile.TemporaryDirectory() as folder:
                 found[name] = part(Path(folder))
     found = {**found.pop('nights', {}), **found}
-    if options.json:
-        print(json.dumps(found, indent=2))
-        return
-    for name, value in found.items():
-        lines = value if isinstance(value, list) else [json.dumps(value)]
-        print(f'{name:18}', '\n                   '.join(lines))
+    bench.tell(found, options.json)
 
 
 if __name__ == '__main__':

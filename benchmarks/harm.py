@@ -28,20 +28,16 @@ arm counts as it is afterwards.
 - `crashed`: share that ended in a traceback. Errors of the package count as not accepted.
 """
 
-import argparse
 import json
-import os
 import time
 import traceback
 from collections import Counter
 from multiprocessing import get_context
 from pathlib import Path
 
-os.environ.setdefault('OMP_NUM_THREADS', '1')
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
-from cell_simulator import misfit, rms
+from cell_simulator import misfit
 from harm_designs import DESIGNS, GOOD, session
 
 from calib_ros.apply.compensation import compensate
@@ -83,7 +79,7 @@ def judge(task):
     one = session(design, number)
     rng = np.random.default_rng([number, 1])
     q = one.nominal.draw(MOST, rng)
-    known = rms(misfit(one.arm.forward(q)[1], *one.nominal.forward(q)))
+    known = bench.rms(misfit(one.arm.forward(q)[1], *one.nominal.forward(q)))
     row = {
         'design': design.name,
         'number': number,
@@ -123,9 +119,9 @@ def used(result, one, rng):
     if len(q) < FEW:
         return row
     wanted = one.arm.forward(q)[1]
-    nominal = rms(misfit(wanted, *one.nominal.forward(q)))
+    nominal = bench.rms(misfit(wanted, *one.nominal.forward(q)))
     reached = result.chain.forward(q)
-    calibrated = rms(misfit(wanted, reached[:, :3, :3], reached[:, :3, 3]))
+    calibrated = bench.rms(misfit(wanted, reached[:, :3, :3], reached[:, :3, 3]))
     row |= {
         'nominal_mm': 1e3 * nominal,
         'calibrated_mm': 1e3 * calibrated,
@@ -233,12 +229,13 @@ def line_of(name, row):
 
 def main():
     """Run all designs and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--quick', action='store_true', help='a tenth of the arms')
-    parser.add_argument('--jobs', type=int, default=2, help='processes')
-    parser.add_argument('--only', default='', help='designs whose names hold this')
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(
+        __doc__,
+        quick=(False, 'a tenth of the arms'),
+        jobs=(2, 'processes'),
+        only=('', 'designs whose names hold this'),
+        json=False,
+    )
     designs = [design for design in DESIGNS if options.only in design.name]
     share = 10 if options.quick else 1
     tasks = [(d, number) for d in designs for number in range(-(-d.arms // share))]

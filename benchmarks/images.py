@@ -9,11 +9,11 @@ detector gets the whole image, the whole dictionary and its own settings. `decod
 such an image as PNG takes besides.
 """
 
-import argparse
 import sys
 import time
 from pathlib import Path
 
+import bench
 import cv2
 import numpy as np
 
@@ -94,9 +94,7 @@ def judged(look, pictures):
 
 def main():
     """Print the figures of all scenes."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--images', type=int, default=8)
-    options = parser.parse_args()
+    options = bench.options(__doc__, images=8)
     cv2.setNumThreads(1)
     print(
         f'OpenCV {cv2.__version__}, {options.images} images each; the last columns by OpenCV alone'

@@ -16,26 +16,20 @@ times larger than usual), few or many poses or positions, gross errors in up to 
 of such that nothing explains: noise of decimetres, joint values of other poses.
 """
 
-import argparse
 import json
-import os
 import time
 from dataclasses import replace
-from pathlib import Path
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision import mistakes, suspects, undoing
 from calib_ros.estimation.problem import Problem
-from calib_ros.files.tables import read_table
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain, shipped_robots
 
-DATA = Path(os.environ.get('CALIB_ROS_DATA') or Path(__file__).parents[2] / 'shared' / 'data')
 SETS = (
     ('ur10_ipa_leica', 'B', 'chain.yaml'),
     ('ur5_jacobi_lasertracker', 'grid', 'chain.yaml'),
@@ -48,13 +42,6 @@ SETS = (
 FACTOR = 3.4
 """Ratio of typical errors below which a mistake makes no difference that could be told."""
 OTHERS = {'ur10': 'ur5e', 'ur5': 'ur10e', 'iiwa': 'franka_fr3', 'wam': 'kuka_iiwa14'}
-
-
-def problem_of(name, session, chain_name):
-    """Return the problem of a data set, with its held-out rows."""
-    chain = load_chain(DATA / name / chain_name)
-    table = read_table(DATA / name / 'uniform.csv', len(chain.joints), (session,))
-    return table.problem(chain)
 
 
 def changed(problem, change):
@@ -291,7 +278,7 @@ def of_real_robots(only, rows, as_json):
         column = f'{name.partition("_")[0]} {session}'
         if only and only not in column:
             continue
-        problem = problem_of(name, session, chain)
+        problem = bench.problem_of(name, session, chain)
         problem = fewer(problem, rows) if rows else problem
         columns.append(column)
         found = mistakes.diagnose(problem)
@@ -368,13 +355,14 @@ def of_clean_sets(count, first):
 
 def main():
     """Print the table, or the false alarms."""
-    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
-    parser.add_argument('--clean', type=int, metavar='N', help='simulated sets without a mistake')
-    parser.add_argument('--first', type=int, default=0, metavar='SEED', help='of these')
-    parser.add_argument('--only', default='', metavar='SET', help='columns with this in the name')
-    parser.add_argument('--rows', type=int, default=0, help='rows of each set, else all')
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(
+        __doc__,
+        clean=({'type': int, 'metavar': 'N'}, 'simulated sets without a mistake'),
+        first=(0, 'seed of the first of these'),
+        only=('', 'columns with this in the name'),
+        rows=(0, 'rows of each set, else all'),
+        json=False,
+    )
     if options.clean is not None:
         of_clean_sets(options.clean, options.first)
     else:

@@ -17,13 +17,9 @@ over the joint range. `claimed`: share of these arms of which `compare` claims a
 second session at other poses; `apart`: after two sessions within 0.6 rad of two postures.
 """
 
-import argparse
-import json
-import os
 from dataclasses import replace
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 
 from calib_ros.apply.simulation import Cell, faulty, measure
@@ -144,11 +140,7 @@ def within(result, q, error):
 
 def main():
     """Run both kinds of measurement and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--runs', type=int, default=1000)
-    parser.add_argument('--quick', action='store_true', help='500 runs')
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(__doc__, runs=1000, quick=(False, '500 runs'), json=False)
     runs = 500 if options.quick else options.runs
     nominal = load_chain('ur10e')
     found = {'runs': runs, 'mse_over_crlb': {}, 'coverage_95': {}}
@@ -181,16 +173,7 @@ def main():
             'apart': float(apart.mean()),
             'ratio': float(np.median(actual / stated)),
         }
-    if options.json:
-        print(json.dumps(found, indent=2))
-        return
-    for kind in KINDS:
-        coverage = ', '.join(f'{k} {100 * v:.1f} %' for k, v in found['coverage_95'][kind].items())
-        print(f'{kind:9} MSE / CRLB {found["mse_over_crlb"][kind]:.3f}; 95 % coverage: {coverage}')
-    few = found['few_unknown_noise']
-    for kind, row in found['incomplete'].items():
-        print(f'{kind:9} lacking:', ', '.join(f'{k} {v:.3f}' for k, v in row.items()))
-    print(f'few, noise unknown: coverage {few["parameters"]:.3f}, {few["positions"]:.3f}')
+    bench.tell(found, options.json)
 
 
 if __name__ == '__main__':

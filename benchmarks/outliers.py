@@ -12,13 +12,9 @@ the world, as from a tracker that was moved, or in the tool's frame, as from a t
 bumped.
 """
 
-import argparse
-import json
-import os
 from dataclasses import replace
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 
 from calib_ros.apply.simulation import Cell, faulty, measure
@@ -70,10 +66,7 @@ def spoiled(observations, flanges, rng, count, low, high, kind):
 
 def main():
     """Run all cases and print them."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--seeds', type=int, default=20)
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(__doc__, seeds=20, json=False)
     nominal = load_chain('ur10e')
     found = {name: {'mean': [], 'ratio': [], 'plain': []} for name in CASES}
     named = {name: [0, 0, 0, 0] for name in CASES}  # hits, gross errors, false alarms, good ones
@@ -84,21 +77,20 @@ def main():
         poses = measure(true, q, rng, 5e-5, 2e-4)
         flanges = true.forward(q)[:, :3, :3]
         unseen = nominal.random_joints(UNSEEN, rng)
-        truth = true.forward(unseen)[:, :3, 3]
         for name, (count, low, high, kind, oriented) in CASES.items():
             clean = poses
             if not oriented:
                 clean = Observations.from_arrays(q, poses.positions)
             seen, wrong = spoiled(clean, flanges, rng, count, low, high, kind)
             result = identify(Problem(nominal, seen))
-            error = np.linalg.norm(result.chain.forward(unseen)[:, :3, 3] - truth, axis=1)
+            error = bench.distances(result.chain, true, unseen)
             good = clean.select(np.array([k not in wrong for k in range(POSES)]))
-            best = identify(Problem(nominal, good, loss='none')).chain.forward(unseen)[:, :3, 3]
-            best = np.linalg.norm(best - truth, axis=1)
-            plain = identify(Problem(nominal, seen, loss='none')).chain.forward(unseen)
+            best, plain = (
+                bench.distances(identify(Problem(nominal, each, loss='none')).chain, true, unseen)
+                for each in (good, seen)
+            )
             found[name]['mean'].append(1e3 * float(error.mean()))
-            found[name]['ratio'].append(float(np.sqrt(np.mean(error**2) / np.mean(best**2))))
-            plain = np.linalg.norm(plain[:, :3, 3] - truth, axis=1)
+            found[name]['ratio'].append(bench.rms(error) / bench.rms(best))
             found[name]['plain'].append(1e3 * float(plain.mean()))
             outliers = {outlier.sample for outlier in result.outliers}
             counts = [len(outliers & wrong), count, len(outliers - wrong), POSES - count]
@@ -114,20 +106,7 @@ def main():
         }
         for name, (hits, count, false, rest) in named.items()
     }
-    if options.json:
-        print(json.dumps(table, indent=2))
-        return
-    print(
-        'gross errors            mean [mm]   plain LSQ   RMS / without   worst   named'
-        '   false alarms'
-    )
-    for name, row in table.items():
-        share = '-' if row['named'] is None else f'{100 * row["named"]:.1f} %'
-        print(
-            f'{name:22} {row["mean_mm"]:10.4f} {row["plain_least_squares_mean_mm"]:11.3f}'
-            f' {row["rms_over_fit_without_outliers"]:15.3f} {row["worst_of_seeds"]:7.3f}'
-            f' {share:>7} {100 * row["false_alarms"]:11.2f} %'
-        )
+    bench.tell(table, options.json)
 
 
 if __name__ == '__main__':

@@ -23,7 +23,6 @@ that exceeds the limit [s], or is expected to, is not tried with more poses. The
 get environments of their own in the folder named; `--quick` uses those that are there.
 """
 
-import argparse
 import json
 import os
 import platform
@@ -37,8 +36,7 @@ from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -279,15 +277,16 @@ def machine():
 
 def main():
     """Run the comparison and print it."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--poses', type=int, nargs='+', default=[50, 500, 5000, 50000, 500000])
-    parser.add_argument('--kinds', nargs='+', choices=('position', 'pose'), default=KINDS)
-    parser.add_argument('--limit', type=float, default=300.0)
-    parser.add_argument('--figure', type=Path)
-    parser.add_argument('--environments', type=Path, default=CACHE)
-    parser.add_argument('--quick', action='store_true')
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(
+        __doc__,
+        poses={'type': int, 'nargs': '+', 'default': [50, 500, 5000, 50000, 500000]},
+        kinds={'nargs': '+', 'choices': KINDS, 'default': KINDS},
+        limit=300.0,
+        figure={'type': Path},
+        environments=CACHE,
+        quick=False,
+        json=False,
+    )
     if options.quick:
         options.poses, options.limit = [50, 500], 5.0
     found = compare(options)

@@ -12,15 +12,12 @@ finds the corners in rendered images (blur 0.7 px, noise of 2 grey levels), whic
 seconds a run. What follows +- is the standard error over the runs.
 """
 
-import argparse
-import os
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 
 from calib_ros.apply.camera import Camera, before_camera, photograph
@@ -78,8 +75,7 @@ def scene(nominal, seed, on_flange, kind, images):
 
 def error_of(chain, true, joints):
     """Return the RMS distance [mm] of positions at other joint values."""
-    away = (chain.forward(joints) - true.forward(joints))[:, :3, 3]
-    return 1e3 * float(np.sqrt((away**2).sum(axis=1).mean()))
+    return 1e3 * bench.rms(bench.distances(chain, true, joints))
 
 
 def one_run(nominal, seed, on_flange, lens, images):
@@ -161,13 +157,14 @@ def over_runs(found, scale=1.0):
 
 def main():
     """Run all cases and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--runs', type=int, default=300)
-    parser.add_argument('--images', type=int, default=40)
-    parser.add_argument('--only', default='', help='only cases with this in their names')
-    parser.add_argument('--speed', action='store_true', help='only how long 500 images take')
-    parser.add_argument('--rendered', action='store_true', help='only by rendered images')
-    options = parser.parse_args()
+    options = bench.options(
+        __doc__,
+        runs=300,
+        images=40,
+        only=('', 'only cases with this in their names'),
+        speed=(False, 'only how long 500 images take'),
+        rendered=(False, 'only by rendered images'),
+    )
     nominal = load_chain('ur10e')
     if options.speed:
         speed(nominal)

@@ -30,16 +30,12 @@ noise alone, without that of the parameters. `a_priori` is the RMS error over th
 the tracker's own noise alone, 0.02 mm. Of UR10 A every fifth row is used.
 """
 
-import argparse
-import json
-import os
 import time
 from dataclasses import replace
+from functools import partial
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
-from real_robots import DATA, problem_of
 
 from calib_ros.apply.candidates import Visibility, draw_candidates
 from calib_ros.apply.choice import Choice
@@ -150,8 +146,7 @@ def simulated_error(nominal, true, joints, unseen, rng, oriented):
     seen = measure(true, joints, rng, *SIGMAS, oriented)
     judge = seen.select(np.arange(1))  # no cross-validation: the verdict is not asked for
     result = identify(Problem(nominal, seen, held_out=judge, loss='none'))
-    error = (result.chain.forward(unseen) - true.forward(unseen))[:, :3, 3]
-    return 1e3 * float(np.sqrt((error**2).sum(axis=1).mean()))
+    return 1e3 * bench.rms(bench.distances(result.chain, true, unseen))
 
 
 def simulated(arm, oriented, draws):
@@ -166,31 +161,23 @@ def simulated(arm, oriented, draws):
     unseen = nominal.random_joints(300, rng)
     design = Design.of(Problem(nominal, measure(nominal, unseen[:1], rng, oriented=oriented)))
     found = {}
+
+    def mean_error(poses_of):
+        every = (poses_of() for _ in range(draws))
+        given = unseen, rng, oriented
+        return float(np.mean([simulated_error(nominal, true, q, *given) for q in every]))
+
     for label, draw in ranges(nominal).items():
         candidates = draw(2000, rng)
         row = {}
         for criterion in ('d', 'task'):
             chosen = Choice(design, candidates, criterion, unseen).best(25)
-            row[criterion] = float(
-                np.mean(
-                    [
-                        simulated_error(nominal, true, candidates[chosen], unseen, rng, oriented)
-                        for _ in range(draws)
-                    ]
-                )
-            )
+            row[criterion] = mean_error(partial(candidates.take, chosen, axis=0))
         share = Choice(design, candidates, 'task', unseen).efficiency(chosen)
         least = accuracy(design, candidates[chosen], unseen)[-1] * np.sqrt(share)
         row['bound'] = 1e3 * float(least)
         for count in (25, 50):
-            row[f'random_{count}'] = float(
-                np.mean(
-                    [
-                        simulated_error(nominal, true, draw(count, rng), unseen, rng, oriented)
-                        for _ in range(draws)
-                    ]
-                )
-            )
+            row[f'random_{count}'] = mean_error(partial(draw, count, rng))
         found[label] = row
     return found
 
@@ -212,16 +199,16 @@ def placement(draws):
     row = {}
     for label, which in (('best', found.best), ('centre', found.centre)):
         there = found.joints[which]
-        missed = (true.forward(there) - arm.before.forward(there))[:, :3, 3]
+        missed = bench.distances(arm.before, true, there)
         row[f'{label}_mm'] = 1e3 * float(found.errors[which])
-        row[f'{label}_true_mm'] = 1e3 * float(np.linalg.norm(missed, axis=1).mean())
+        row[f'{label}_true_mm'] = 1e3 * float(missed.mean())
     rows = {'nominal model': row}
     found, row = place(arm, task, 'mean', 'corrected'), {}
     for label, which in (('best', found.best), ('centre', found.centre)):
         there = found.joints[which]
-        left = [(r.chain.forward(there) - true.forward(there))[:, :3, 3] for r in results]
-        row[f'{label}_mm'] = 1e3 * float(np.sqrt(np.mean(arm.sigma(there) ** 2)))
-        row[f'{label}_true_mm'] = 1e3 * float(np.sqrt((np.array(left) ** 2).sum(axis=2).mean()))
+        left = [bench.distances(each.chain, true, there) for each in results]
+        row[f'{label}_mm'] = 1e3 * bench.rms(arm.sigma(there))
+        row[f'{label}_true_mm'] = 1e3 * bench.rms(left)
     return rows | {'identified model': row}
 
 
@@ -254,7 +241,7 @@ def outer(problem):
 
 def measured(name, session, tracker, draws):
     """Return the figures of one measured robot."""
-    problem = problem_of(name, session, 'chain.yaml')
+    problem = bench.problem_of(name, session)
     rows = np.arange(0, len(problem.observations), 1 + len(problem.observations) // MOST_ROWS)
     problem = replace(problem, observations=problem.observations.select(rows))
     joints = problem.observations.joints
@@ -293,36 +280,19 @@ def measured(name, session, tracker, draws):
 
 def main():
     """Run everything and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--quick', action='store_true', help='fewer draws, without UR10 A')
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(__doc__, quick=(False, 'fewer draws, without UR10 A'), json=False)
     found = {'speed': speed(), 'simulated': {}, 'measured': {}}
     for arm in ARMS:
         for kind, oriented in (('pose', True), ('position', False)):
             rows = simulated(arm, oriented, 20 if options.quick else 200)
             found['simulated'] |= {f'{arm}, {kind}, {label}': row for label, row in rows.items()}
     found['placement'] = placement(10 if options.quick else 100)
-    for (name, session), tracker in SETS.items():
-        if DATA.is_dir() and not (options.quick and session == 'A'):
+    for (name, session), tracker in bench.measured(SETS).items():
+        if not (options.quick and session == 'A'):
             found['measured'][f'{name}/{session}'] = measured(
                 name, session, tracker, 3 if options.quick else 10
             )
-    if options.json:
-        print(json.dumps(found, indent=2))
-        return
-    clock = found['speed']
-    print('  '.join(f'{name} {1e3 * value:.0f} ms' for name, value in clock['seconds'].items()))
-    print(f'plans {clock["ratio"]:.0f} x faster than naive; same choice: {clock["same_choice"]}')
-    print(f'maps {clock["ratio_of_maps"]:.0f} x faster than one configuration at a time')
-    if not DATA.is_dir():
-        print(f'no measured robots at {DATA}; set CALIB_ROS_DATA')
-    for table in ('simulated', 'placement', 'measured'):
-        columns = dict.fromkeys(key for row in found[table].values() for key in row)
-        print('\n' + f'{table:42}' + ' '.join(f'{column:>17}' for column in columns))
-        for label, row in found[table].items():
-            cells = (f'{row[c]:17.4g}' if c in row else ' ' * 17 for c in columns)
-            print(f'{label:42}' + ' '.join(cells))
+    bench.tell(found, options.json)
 
 
 if __name__ == '__main__':

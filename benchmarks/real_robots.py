@@ -15,28 +15,22 @@ refitted (`from ...`). On what `auto` leaves there, more was tried: the temperat
 time, and a Gaussian process on the joint angles, all fitted to the residuals of the fitted rows.
 """
 
-import argparse
 import csv
 import json
-import os
 import time
 from dataclasses import replace
-from pathlib import Path
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
-from cell_simulator import misfit, rms
+from cell_simulator import misfit
 from scipy import linalg
 from scipy.spatial.distance import cdist
 
-from calib_ros.files.tables import read_table
 from calib_ros.identification.identification import identify
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.se3 import norms
 
-DATA = Path(os.environ.get('CALIB_ROS_DATA') or Path(__file__).parents[2] / 'shared' / 'data')
 # Held-out RMS [mm] of an independent plain least squares with the geometric model.
 SETS = {
     ('ur10_ipa_leica', 'A', 'chain.yaml'): 0.437,
@@ -59,13 +53,6 @@ PUBLISHED = {
 UR10 = 'ur10_ipa_leica'
 NEAR, FEW = 40, 12
 """Sets of near poses of each robot, and rows that are too few to judge by."""
-
-
-def problem_of(name, session, chain_name):
-    """Return the problem of a data set, with its held-out rows."""
-    chain = load_chain(DATA / name / chain_name)
-    table = read_table(DATA / name / 'uniform.csv', len(chain.joints), (session,))
-    return table.problem(chain)
 
 
 def row(label, figures, result, seconds):
@@ -123,7 +110,7 @@ def rows_of(problem):
 
 def transfer():
     """Yield how well the arm of one session of the UR10 predicts the other."""
-    problems = {session: problem_of(UR10, session, 'chain.yaml') for session in 'AB'}
+    problems = {session: bench.problem_of(UR10, session) for session in 'AB'}
     for source, target in ('BA', 'AB'):
         for model in ('geometric', 'gravity', 'eccentricity', 'auto'):
             result = identify_model(problems[source], model)
@@ -138,18 +125,17 @@ def transfer():
 
 def tried(session):
     """Yield the RMS [mm] on held-out rows with more fitted to what `auto` leaves."""
-    problem = problem_of(UR10, session, 'chain.yaml')
+    problem = bench.problem_of(UR10, session)
     result = identify_model(problem, 'auto')
     fitted, test = result.fitted.after.position, result.validation.after.position
-    with open(DATA / UR10 / 'uniform.csv', encoding='utf-8') as file:
+    with open(bench.DATA / UR10 / 'uniform.csv', encoding='utf-8') as file:
         rows = [row for row in csv.DictReader(file) if row['session'] == session]
     train = np.array([row['split'] == 'train' for row in rows])
     temperature = np.array([float(row['temperature_C']) for row in rows])
     time_of = np.arange(len(rows)) / len(rows)
 
     def rms(errors):
-        squares = (errors[result.validation.counting] ** 2).sum(axis=1)
-        return 1e3 * float(np.sqrt(squares.mean()))
+        return 1e3 * bench.rms(norms(errors[result.validation.counting]))
 
     yield 'auto', rms(test)
     scaled = (temperature - temperature.mean()) / temperature.std()
@@ -210,7 +196,7 @@ def worse_in_region(result, rest):
     poses = [each.forward(inside.joints) for each in (result.before, result.chain)]
     before, after = (misfit(inside.positions, p[:, :3, :3], p[:, :3, 3]) for p in poses)
     good = np.maximum(before, after) < 8.0 * np.median(after)  # without gross errors
-    return bool(rms(after[good]) > 1.05 * rms(before[good]))
+    return bool(bench.rms(after[good]) > 1.05 * bench.rms(before[good]))
 
 
 def near_poses():
@@ -218,7 +204,7 @@ def near_poses():
     for name, session, chain_name in SETS:
         if name in ('positioner_2axis_pose', 'mukca_sockets'):
             continue
-        problem, rng = problem_of(name, session, chain_name), np.random.default_rng(0)
+        problem, rng = bench.problem_of(name, session, chain_name), np.random.default_rng(0)
         verdicts = []
         for _ in range(NEAR):
             near, rest = near_one_pose(problem.observations, rng)
@@ -234,16 +220,13 @@ def near_poses():
 
 def main():
     """Run all sets and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--json', action='store_true')
-    parser.add_argument('--near', action='store_true', help='only from near poses')
-    options = parser.parse_args()
+    options = bench.options(__doc__, json=False, near=(False, 'only from near poses'))
     if options.near:
         near_poses()
         return
     found = {}
     for (name, session, chain_name), reference in SETS.items():
-        lines = list(rows_of(problem_of(name, session, chain_name)))
+        lines = list(rows_of(bench.problem_of(name, session, chain_name)))
         published = PUBLISHED.get((name, session))
         found[f'{name}/{session}'] = {
             'reference_rms_mm': reference,

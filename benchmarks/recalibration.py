@@ -28,13 +28,9 @@ which has been moved, has smooth errors as large as its sigma, then and now.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 from dataclasses import replace
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 
 from calib_ros.apply.candidates import Visibility, draw_candidates
@@ -215,11 +211,9 @@ def few_of_all(arms):
 
 def main():
     """Print the figures of all arms."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--quick', action='store_true', help='fewer arms')
-    parser.add_argument('--json', action='store_true', help='print the figures as JSON')
-    parser.add_argument('--poses', type=int, default=8, help='after the collision')
-    options = parser.parse_args()
+    options = bench.options(
+        __doc__, quick=(False, 'fewer arms'), poses=(8, 'after the collision'), json=False
+    )
     counts = (
         {'zero': 20, 'twisted': 20, 'bent': 20, 'none': 40}
         if options.quick
@@ -247,11 +241,7 @@ def main():
             **{f'{key}_mm': value for key, value in rms.items()},
         }
     figures |= few_of_all(2 if options.quick else 10)
-    if options.json:
-        print(json.dumps(figures))
-        return
-    for kind, row in figures.items():
-        print(kind, ', '.join(f'{key} {value:.3g}' for key, value in row.items()))
+    bench.tell(figures, options.json)
 
 
 if __name__ == '__main__':

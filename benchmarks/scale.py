@@ -12,16 +12,12 @@ than 0.01 mm; `by scale` those refused because of the scale; `other` those refus
 reason. With `--checked` the scale is stated as known to that (`sigma_scale`), right or wrong.
 """
 
-import argparse
-import os
 from collections import Counter
 from dataclasses import replace
 
-os.environ.setdefault('OMP_NUM_THREADS', '1')
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
-from cell_simulator import misfit, rms
+from cell_simulator import misfit
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.reasons import Rule
@@ -85,17 +81,20 @@ def judged(name, number, size, scale, checked):
     q = q[result.region.covers(q)]
     wanted = true.forward(q)[:, :3, 3]
     reached = result.chain.forward(q), replace(chain, base=true.base, tool=true.tool).forward(q)
-    after, before = (rms(misfit(wanted, each[:, :3, :3], each[:, :3, 3])) for each in reached)
+    after, before = (
+        bench.rms(misfit(wanted, each[:, :3, :3], each[:, :3, 3])) for each in reached
+    )
     return 'harmful' if after > max(before, 1e-5) else 'good'
 
 
 def main():
     """Print a line for each arm and scale."""
-    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
-    parser.add_argument('--arms', type=int, default=40, help='of each kind and size of errors')
-    parser.add_argument('--only', default='', help='arms whose names hold this')
-    parser.add_argument('--checked', type=float, default=0.0, help='stated error of the scale')
-    options = parser.parse_args()
+    options = bench.options(
+        __doc__,
+        arms=(40, 'of each kind and size of errors'),
+        only=('', 'arms whose names hold this'),
+        checked=(0.0, 'stated error of the scale'),
+    )
     heads = ('good', 'harmful', 'by scale', 'other')
     print(f'{"arm":14}{"scale":>8}' + ''.join(f'{head:>10}' for head in heads))
     total = {scale: Counter() for scale in SCALES}

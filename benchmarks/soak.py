@@ -22,7 +22,6 @@ way, plus what it received and does not account for: received poses = in samples
 used + dropped.
 """
 
-import argparse
 import copy
 import csv
 import json
@@ -35,8 +34,8 @@ import tracemalloc
 from pathlib import Path
 
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
+import bench
 import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
@@ -369,15 +368,16 @@ def steady(heard):
 
 def main():
     """Play the part that is asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--minutes', type=float, default=10.0)
-    parser.add_argument('--rates', type=float, nargs=2, default=(1000.0, 1000.0), metavar='HZ')
-    parser.add_argument('--frames', type=int, default=0)
-    parser.add_argument('--quick', action='store_true')
-    parser.add_argument('--json', action='store_true')
-    parser.add_argument('--namespace', default=f'/soak_{os.getpid()}', help=argparse.SUPPRESS)
-    parser.add_argument('--role', choices=('publisher', 'empty'), help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    options = bench.options(
+        __doc__,
+        minutes=10.0,
+        rates={'type': float, 'nargs': 2, 'default': (1000.0, 1000.0), 'metavar': 'HZ'},
+        frames=0,
+        quick=False,
+        json=False,
+        namespace=(f'/soak_{os.getpid()}', 'of its processes'),
+        role=({'choices': ('publisher', 'empty')}, 'of one of them'),
+    )
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
     rclpy.init(args=[])
     if options.role == 'publisher':
@@ -389,11 +389,7 @@ def main():
             os.environ['ROS_HOME'] = folder
             seconds = 30.0 if options.quick else 60.0 * options.minutes
             found = run(options, seconds, Path(folder))
-        if options.json:
-            print(json.dumps(found))
-        else:
-            for name, value in found.items():
-                print(f'{name:36} {value}')
+        bench.tell(found, options.json)
 
 
 if __name__ == '__main__':

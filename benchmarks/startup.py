@@ -8,8 +8,6 @@
 cross-validation. The shortest times of several.
 """
 
-import argparse
-import json
 import os
 import resource
 import subprocess
@@ -18,6 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import bench
 from peers import machine
 
 
@@ -36,11 +35,7 @@ def spent(times, *arguments):
 
 def main():
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--repeat', type=int, default=7)
-    parser.add_argument('--quick', action='store_true')
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(__doc__, repeat=7, quick=False, json=False)
     times = 2 if options.quick else options.repeat
     os.environ['PYTHONPATH'] = str(Path(__file__).parents[1])
     with tempfile.TemporaryDirectory() as name:
@@ -50,12 +45,7 @@ def main():
             '--help': spent(times, '--help'),
             'identify, 60 poses': spent(times, 'identify', bag, '--chain', 'ur10e'),
         }
-    if options.json:
-        print(json.dumps({'machine': machine(), 'figures': figures}))
-        return
-    print(machine())
-    for what, each in figures.items():
-        print(f'{what:20} {each["wall_s"]:.2f} s, {each["cpu_s"]:.2f} s of CPU')
+    bench.tell({'machine': machine(), 'figures': figures}, options.json)
 
 
 if __name__ == '__main__':

@@ -16,17 +16,13 @@ is one imperfection in several sizes.
 - `untold`: refused without a warning, a remark or a named mistake.
 """
 
-import argparse
 import json
-import os
 from collections import Counter
 from functools import cache
 
-os.environ.setdefault('OMP_NUM_THREADS', '1')
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
-from cell_simulator import misfit, rms
+from cell_simulator import misfit
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.reasons import Rule
@@ -109,7 +105,7 @@ class Session:
         told |= any(each.rule in (Rule.MISTAKE, Rule.SCALE) for each in result.refusals)
         q = CHAIN.random_joints(1000, np.random.default_rng(1))
         wanted, found = self.true.forward(q)[:, :3, 3], result.chain.forward(q)
-        error = 1e3 * rms(misfit(wanted, found[:, :3, :3], found[:, :3, 3]))
+        error = 1e3 * bench.rms(misfit(wanted, found[:, :3, :3], found[:, :3, 3]))
         return (error if result.accepted else None), len(result.outliers), told
 
 
@@ -203,10 +199,7 @@ def row_of(change, sizes, designs):
 
 def main():
     """Run all imperfections and print what became of them."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--only', default='', help='imperfections whose names hold this')
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(__doc__, only=('', 'imperfections whose names hold this'), json=False)
     found = {}
     for name, (change, sizes) in IMPERFECTIONS.items():
         for where, designs in (('', DESIGNS), (', in motion', MOTION)):

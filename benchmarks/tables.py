@@ -10,14 +10,11 @@ target and split, rotations of quaternions, every number within its limits. `for
 table in millimetres and degrees with decimal commas.
 """
 
-import argparse
 import json
-import os
 import tempfile
 from pathlib import Path
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 from peers import cpu
 
@@ -66,10 +63,7 @@ def tables_of(folder, rows):
 
 def main():
     """Print a line for each kind of table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
-    parser.add_argument('--rows', type=int, default=500_000)
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(__doc__, rows=500_000, json=False)
     foreign = Foreign(Layout(length='mm', angle='deg', separator='semicolon', decimal=','))
     found = []
     with tempfile.TemporaryDirectory() as folder:

@@ -19,14 +19,8 @@ over 500 positions in the same cube with the same orientation (`cube`), and over
 range (`range`), of which five poses in one orientation tell less.
 """
 
-import argparse
-import json
-import os
-
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
-from real_robots import DATA, problem_of
 
 from calib_ros.apply.confidence import freedom_of, rms_limits
 from calib_ros.apply.design import Design
@@ -39,6 +33,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics import inverse
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.se3 import norms
 
 SETS = (
     ('ur10_ipa_leica', 'B'),
@@ -48,11 +43,6 @@ SETS = (
     ('fr3_camera_eyeinhand', 'all'),
 )
 NOISE = (5e-5, 2e-4)
-
-
-def rms(errors):
-    """Return the RMS length of errors (N, 3)."""
-    return float(np.sqrt((errors**2).sum(axis=1).mean()))
 
 
 def shares(found, truth):
@@ -91,12 +81,12 @@ def drawn(kind, draws):
     for count in (5, 10, 20, 40, 100):
         held = []
         for errors in arms:
-            truth = rms(errors)
+            truth = bench.rms(norms(errors))
             for _ in range(draws // len(arms)):
                 chosen = errors[rng.integers(0, len(errors), count)]
                 moments = chosen[:, :, None] * chosen[:, None]
                 freedom = np.array([count * freedom_of(moments)])
-                lower, upper = rms_limits(rms(chosen), freedom, 0.95)
+                lower, upper = rms_limits(bench.rms(norms(chosen)), freedom, 0.95)
                 held.append((upper[0] >= truth, lower[0] <= truth))
         upper, lower = np.mean(held, axis=0).tolist()
         rows[f'{count} poses'] = {'upper': upper, 'lower': lower}
@@ -105,13 +95,13 @@ def drawn(kind, draws):
 
 def measured(name, session, draws):
     """Return how often the limits hold on a measured robot, by the number of poses."""
-    problem = problem_of(name, session, 'chain.yaml')
+    problem = bench.problem_of(name, session)
     result = identify(problem)
     arm = Calibration.of(result)
     held_out = problem.judging[0].select(result.validation.deciding)
     _, first = np.unique(held_out.configurations, return_index=True)
     held_out = held_out.select(first)
-    truth = rms(residuals(arm.chain, held_out).position)
+    truth = bench.rms(norms(residuals(arm.chain, held_out).position))
     rng = np.random.default_rng(0)
     row = {}
     for count in (5, 10, 20):
@@ -147,30 +137,20 @@ def simulated(draws):
             (in_range, nominal.random_joints(500, rng)),
         ):
             error = measure(true, joints, rng, *NOISE).positions
-            truths.append(rms(error - result.chain.forward(joints)[:, :3, 3]))
+            error -= result.chain.forward(joints)[:, :3, 3]
+            truths.append(bench.rms(norms(error)))
     return {'cube': shares(found, in_cube), 'range': shares(found, in_range)}
 
 
 def main():
     """Run everything and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--quick', action='store_true', help='fewer draws')
-    parser.add_argument('--json', action='store_true')
-    options = parser.parse_args()
+    options = bench.options(__doc__, quick=(False, 'fewer draws'), json=False)
     table = {'UR10e, simulated, ISO 9283': simulated(10 if options.quick else 60)}
     for kind in ('noise', 'compliance', 'eccentricity', 'places'):
         table[f'drawn, {kind}'] = drawn(kind, 600 if options.quick else 12_000)
-    for name, session in SETS:
-        if DATA.is_dir():
-            table[f'{name}/{session}'] = measured(name, session, 100 if options.quick else 1000)
-    if options.json:
-        print(json.dumps(table, indent=2))
-        return
-    if not DATA.is_dir():
-        print(f'no measured robots at {DATA}; set CALIB_ROS_DATA')
-    for label, row in table.items():
-        cells = (f'{k}: {v["upper"]:.3f} upper, {v["lower"]:.3f} lower' for k, v in row.items())
-        print(f'{label:32} ' + '; '.join(cells))
+    for name, session in bench.measured(SETS):
+        table[f'{name}/{session}'] = measured(name, session, 100 if options.quick else 1000)
+    bench.tell(table, options.json)
 
 
 if __name__ == '__main__':
