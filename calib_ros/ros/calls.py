@@ -25,7 +25,7 @@ class InOrder(Waitable):  # type: ignore[misc]  # see pyproject.toml
     def __init__(self, node: Node) -> None:
         super().__init__(node.default_callback_group)
         self._logger = node.get_logger()
-        self._services: list[Service] = list(node.services)
+        self._services: list[Service] = [*filter(node.polled.has_entity, node.services)]
         self._places: list[int] = []  # in the wait set
         self._waited = ExitStack()
         node.add_waitable(self)
@@ -41,10 +41,6 @@ class InOrder(Waitable):  # type: ignore[misc]  # see pyproject.toml
     def __exit__(self, *error: object) -> None:
         """Let services be destroyed."""
         self._waited.close()
-
-    def __contains__(self, service: object) -> bool:
-        """Tell whether a service is one of these, not to be served by the executor."""
-        return service in self._services
 
     def get_num_entities(self) -> NumberOfEntities:
         """Return what it adds to a wait set."""
@@ -70,14 +66,18 @@ class InOrder(Waitable):  # type: ignore[misc]  # see pyproject.toml
         return sorted(come, key=itemgetter(0))
 
     async def execute(self, taken_data: list[tuple[int, Service, Any, Any]]) -> None:
-        """Answer calls; the answer of one that fails is blank."""
+        """Answer calls; the answer of one that fails is blank.
+
+        To be answered later, a callback returns a function that takes how to send the answer.
+        """
         for _, service, request, header in taken_data:
-            response = service.srv_type.Response()
+            send = partial(service.send_response, header=header)
+            answer = service.srv_type.Response()
             try:
                 try:
-                    response = service.callback(request, response)
+                    answer = service.callback(request, answer)
                 finally:
-                    service.send_response(response, header)
+                    answer(send) if callable(answer) else send(answer)
             except Exception as err:  # as of rclpy, for a parameter of no known type
                 name = service.srv_name
                 self._logger.error(f'{name}: the call cannot be answered: {err!r}')

@@ -16,13 +16,11 @@ from calib_ros.ros.boundary import Answer
 
 
 class DeferredTrigger:
-    """A Trigger service whose work runs on a separate thread.
+    """A Trigger service whose work runs on a separate thread, and is answered when it ends.
 
-    The answer is sent through the service's `send_response` right after the callback, on the same
-    thread. It is replaced here by one that holds the answer back until the work has ended. An
-    async callback starves the node's timers in rclpy's single-threaded
-    executor. Several threads, one for each such service and one for the rest, would need a lock
-    around the session, and cost an idle node 13 % more. A call during the work is refused at once.
+    An async callback starves the node's timers in rclpy's single-threaded executor. Several
+    threads, one for each such service and one for the rest, would need a lock around the session,
+    and cost an idle node 13 % more. A call during the work is refused at once.
 
     `prepare` returns a snapshot on the executor's thread, `work` answers from it. `answer` takes
     the name and either of them, and converts its result or exception to an answer.
@@ -40,10 +38,7 @@ class DeferredTrigger:
         self._prepare, self._work = prepare, work
         self._thread: threading.Thread | None = None
         self._running = threading.Event()
-        self._snapshot: list[Any] = []
-        self._service = node.create_service(Trigger, name, self._on_call)
-        self._send = self._service.send_response
-        self._service.send_response = self._send_unless_deferred
+        node.create_service(Trigger, name, self._on_call)
 
     @property
     def busy(self) -> bool:
@@ -57,28 +52,27 @@ class DeferredTrigger:
         return self._thread is None or not self._thread.is_alive()
 
     def _on_call(self, request: Any, response: Any) -> Any:
+        """Return what begins the work (`InOrder.execute`), or the answer that it cannot."""
+        snapshot: list[Any] = []
+
         def prepare() -> Answer:
             if self.busy:
                 return False, 'refused: the previous call is still running; wait for its answer'
-            self._snapshot = [self._prepare()]
+            snapshot.append(self._prepare())
             return True, ''
 
         response.success, response.message = self._answer(prepare)
-        return response
+        return partial(self._begin, *snapshot, response) if snapshot else response
 
-    def _send_unless_deferred(self, response: Any, header: Any) -> None:
-        if not self._snapshot:
-            self._send(response, header)
-            return
-        given = self._snapshot.pop(), response, header
+    def _begin(self, *given: Any) -> None:
         self._running.set()
         self._thread = threading.Thread(target=self._run, args=given, daemon=True)
         self._thread.start()
 
-    def _run(self, snapshot: Any, response: Any, header: Any) -> None:
+    def _run(self, snapshot: Any, response: Any, send: Callable[[Any], None]) -> None:
         response.success, response.message = self._answer(lambda: self._work(snapshot))
         self._running.clear()  # before the answer, since the caller may call again at once
         try:
-            self._send(response, header)
+            send(response)
         except Exception:  # the node has ended
             return

@@ -12,12 +12,13 @@ from __future__ import annotations
 import importlib
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -27,7 +28,6 @@ from rclpy.serialization import deserialize_message
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.time_source import CLOCK_TOPIC
-from rclpy.waitable import Waitable
 
 from calib_ros.errors import ConfigError
 from calib_ros.sampling.batches import BATCH
@@ -122,7 +122,7 @@ class _Due:
 class Inputs:
     """Subscriptions to streams of messages, emptied by hand."""
 
-    def __init__(self, node: Node, streams: Sequence[Stream]) -> None:
+    def __init__(self, node: Batched, streams: Sequence[Stream]) -> None:
         self._node = node
         self._topics: dict[str, TopicState] = {}
         self._looked_at = time.monotonic()
@@ -131,10 +131,6 @@ class Inputs:
         self._inputs = dict(self._subscribe(stream) for stream in streams)
         self._not_latched = [stream for stream in streams if stream.type == CAMERA_INFO]
         self._events = dict.fromkeys((e for each in self._inputs for e in each.event_handlers), 0)
-
-    def __contains__(self, entity: object) -> bool:
-        """Tell whether an entity is one of these subscriptions or their events."""
-        return entity in self._inputs or entity in self._events
 
     def take(self) -> list[tuple[Stream, bytes]]:
         """Return the messages since the last call, in order of arrival."""
@@ -253,6 +249,7 @@ class Inputs:
                 message_lost=lost, use_default_callbacks=False
             ),
             raw=True,
+            callback_group=self._node.polled,
             **more,
         )
 
@@ -277,56 +274,42 @@ class Inputs:
         return sorted(found)
 
 
+class Polled(CallbackGroup):  # type: ignore[misc]  # see pyproject.toml
+    """Entities that no executor serves, since they are polled."""
+
+    def can_execute(self, entity: object) -> bool:
+        """Return False, so that no executor waits for an entity."""
+        return False
+
+
 class Batched(Node):  # type: ignore[misc]  # see pyproject.toml
-    """A node whose executor serves none of its `polled` entities.
+    """A node with `polled` entities: services (`calls.py`), the time, and those of that group.
 
     At 1 kHz /clock alone takes an executor a third of a core: `take_time` takes it.
     """
 
-    _times: Subscription | None = None
+    def __init__(self, *args: Any, **more: Any) -> None:
+        self.polled = Polled()
+        super().__init__(*args, **more)
 
-    @property
-    def polled(self) -> Iterator[Any]:
-        """Return collections of what is polled, also during construction."""
-        yield (self._times, *(self._times.event_handlers if self._times else ()))
-
-    @property
-    def subscriptions(self) -> Iterator[Subscription]:
-        """Return the subscriptions that an executor serves."""
-        return self._served(super().subscriptions)
-
-    @property
-    def waitables(self) -> Iterator[Waitable]:
-        """Return the waitables that an executor serves."""
-        return self._served(super().waitables)
-
-    @property
-    def services(self) -> Iterator[Service]:
-        """Return the services that an executor serves."""
-        return self._served(super().services)
-
-    def create_subscription(
-        self, msg_type: Any, topic: str, callback: Callable[..., None], *args: Any, **more: Any
-    ) -> Subscription:
+    def create_subscription(self, kind: Any, topic: str, *args: Any, **more: Any) -> Subscription:
         """Subscribe; the time is polled."""
-        found = super().create_subscription(msg_type, topic, callback, *args, **more)
-        if topic == CLOCK_TOPIC:
-            self._times = found
-        return found
+        own = {'callback_group': self.polled} if topic == CLOCK_TOPIC else {}
+        return super().create_subscription(kind, topic, *args, **more | own)
+
+    def create_service(self, *args: Any, **more: Any) -> Service:
+        """Offer a service, to be answered by `InOrder`."""
+        return super().create_service(*args, **more | {'callback_group': self.polled})
 
     def take_time(self) -> None:
         """Take the last time on /clock; an invalid one must not end the node."""
-        for times in super().subscriptions:
-            for _, message in _waiting(times)[-1:] if times is self._times else ():
+        for times in self.subscriptions:
+            for _, message in _waiting(times)[-1:] if times.topic == CLOCK_TOPIC else ():
                 if message.clock.sec >= 0:
                     times.callback(message)
                     continue
                 words = f'negative times on {CLOCK_TOPIC} are not used, {message.clock.sec} s say'
                 self.get_logger().warning(words, once=True)
-
-    def _served(self, entities: Iterator[Any]) -> Iterator[Any]:
-        polled = tuple(self.polled)
-        return (each for each in entities if not any(each in some for some in polled))
 
 
 def deserialised(data: bytes, name: str) -> Any:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import sys
 import textwrap
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import Any
 
@@ -210,13 +210,6 @@ class CalibrationNode(Batched):
         sources = parse_sources(settings.sources) or STANDARD
         types = {source.topic: 'geometry_msgs/msg/PoseStamped' for source in sources}
         return [*(Stream(topic, JOINT_STATE) for topic in topics), *source_streams(sources, types)]
-
-    @property
-    def polled(self) -> Iterator[Any]:
-        """Return collections of what no executor serves; rclpy asks during construction."""
-        yield from super().polled
-        for name in ('_inputs', '_calls'):
-            yield getattr(self, name, ())
 
     def _take_messages(self) -> None:
         for problem in feed(self.session, self._inputs.take(), deserialised):
