@@ -348,12 +348,12 @@ class Collector:
                     self.unused[Cause(POSES, 'another image of a stop that has one')] += more
                 motion = self.track.at(stamps[good], standing=not moving)
                 measured.update(numbers[good].tolist())
-                seen = Found(key, numbers[good], rows.stamps[good], rows.values[good])
-                begins = np.flatnonzero(np.diff(seen.numbers, prepend=-1))
+                begins = np.flatnonzero(np.diff(numbers[good], prepend=-1))
                 begins = np.arange(len(good)) if moving else begins
                 approach = self.track.approach(stamps[good[begins]], motion.joints[begins])
-                delay, sigma = 1e-9 * self.delay_ns, self.settings.sigma_position
-                found += self.sampler.samples(seen, motion, begins, approach, delay, sigma)
+                seen = key, numbers[good], rows.stamps[good], rows.values[good], begins
+                noise = 1e-9 * self.delay_ns, self.settings.sigma_position
+                found += self.sampler.samples(Found(*seen, motion, approach, *noise))
             rows.keep(slice(due, None))
         for stop in () if moving else plan.stops:
             self.unmeasured = 0 if stop in measured else self.unmeasured + 1

@@ -32,12 +32,21 @@ TWICE = 'same stamp twice'
 
 
 class Found(NamedTuple):
-    """Measurements (N,) of one stream, with the numbers of their rounds or stops."""
+    """Measurements (N,) of one stream, with the numbers of their rounds or stops.
+
+    Stops, or single measurements of a moving arm, begin at `begins` (S,), approached with the
+    signs `approach` (S, n). Measurements are late by `delay` [s] and scatter by `sigma` [m].
+    """
 
     key: StreamKey
     numbers: Index
     stamps: Stamps
     values: FloatArray
+    begins: Index
+    motion: Motion
+    approach: FloatArray
+    delay: float
+    sigma: float
 
 
 class Sampler:
@@ -56,24 +65,12 @@ class Sampler:
         self.rested = self.restless = 0  # stops with measurements at rest, and not
         self.doubled: list[float] = []  # spreads [m] of those in two places by turns
 
-    def samples(
-        self,
-        found: Found,
-        motion: Motion,
-        begins: Index,
-        approach: FloatArray,
-        delay: float,
-        sigma: float,
-    ) -> Iterator[Numbered]:
-        """Yield a sample of the measurements of each stop, unless they spread too much.
-
-        Stops, or single measurements of a moving arm, begin at `begins` (S,), approached with the
-        signs `approach` (S, n). Measurements are late by `delay` [s] and scatter by `sigma` [m].
-        """
-        key, numbers, stamps, values = found
+    def samples(self, found: Found) -> Iterator[Numbered]:
+        """Yield a sample of the measurements of each stop, unless they spread too much."""
+        key, numbers, stamps, values, begins, motion, approach, delay, sigma = found
         counts = np.diff(begins, append=len(values))
         if key.images:
-            yield from self._of_images(found, motion, begins, approach, delay)
+            yield from self._of_images(found)
             return
         turned = ~np.isnan(values[:, QUAT_SLICE]).any(axis=1)
         positions = values[:, DISTANCE_SLICE if key.distance else POSITION_SLICE]
@@ -115,10 +112,8 @@ class Sampler:
                 spread=float(means.spreads[k]),
             )
 
-    def _of_images(
-        self, found: Found, motion: Motion, begins: Index, approach: FloatArray, delay: float
-    ) -> Iterator[Numbered]:
-        key, numbers, stamps, values = found
+    def _of_images(self, found: Found) -> Iterator[Numbered]:
+        key, numbers, stamps, values, begins, motion, approach, delay, _ = found
         ends = np.append(begins[1:], len(values))
         joints = self._mean(motion.joints, begins, np.ones(len(values), dtype=bool))
         for k, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):

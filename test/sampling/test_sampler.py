@@ -25,11 +25,9 @@ def samples(rotations, rng, spikes=(), stops=1):
     values[:, 3:7] = np.tile(se3.to_quat(rotations), (stops, 1))
     still = np.zeros((stops * count, 1))
     stamps = 1 + np.arange(stops * count)
-    numbers = np.repeat(np.arange(stops), count)
-    made = Sampler(np.array([True]), 100)
-    found = Found(POSE, numbers, stamps, values)
-    begins = count * np.arange(stops)
-    made.add(list(made.samples(found, Motion(still), begins, still[begins], 0.0, NOISE)))
+    numbers, begins = np.repeat(np.arange(stops), count), count * np.arange(stops)
+    made, at_rest = Sampler(np.array([True]), 100), (Motion(still), still[begins], 0.0, NOISE)
+    made.add([*made.samples(Found(POSE, numbers, stamps, values, begins, *at_rest))])
     return made.take()
 
 
@@ -70,9 +68,9 @@ def test_images_of_a_stop_have_the_stamp_of_the_middle_one():
     values = np.full((10, ROW_WIDTH), np.nan)
     values[:, 0] = np.arange(10)
     made, still = Sampler(np.array([True]), 100), np.zeros((10, 1))
-    found = Found(POSE._replace(images=True), np.zeros(10, int), 10 + np.arange(10), values)
-    begins = np.array([0, 3])
-    made.add(list(made.samples(found, Motion(still), begins, still[begins], 0.0, NOISE)))
+    key, stamps, begins = POSE._replace(images=True), 10 + np.arange(10), np.array([0, 3])
+    seen = key, np.zeros(10, int), stamps, values, begins
+    made.add([*made.samples(Found(*seen, Motion(still), still[begins], 0.0, NOISE))])
     known = [(each.stamp_ns, each.images) for each in made.take()[0]]
     assert known == [(11, (0, 1, 2)), (16, (3, 4, 5, 6, 7, 8, 9))]
 
