@@ -8,7 +8,6 @@ targets.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -19,7 +18,7 @@ from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
 from calib_ros.estimation.levels import SURE
 from calib_ros.estimation.normal import normal_equations
-from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import robust_fit
 from calib_ros.estimation.samples import residual_arrays
@@ -27,7 +26,6 @@ from calib_ros.estimation.sizes import solved
 from calib_ros.estimation.start import start_frames
 from calib_ros.estimation.system import Prior
 from calib_ros.estimation.weights import OUTER
-from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import DELAY, DH_ANGLES, Parameter
 from calib_ros.kinematics.se3 import Flags, FloatArray, norms
@@ -50,9 +48,9 @@ def live_fit(problem: Problem, samples: Sequence[Sample], count: int) -> Update:
     if chance_of_outliers(robust, robust.fit.chain, names, system, spare) > 1.0 - SURE:
         robust = robust_fit(robust.fit.chain, names, system, 'none')
     chain, sigmas = robust.fit.chain, (problem.sigma_position, problem.sigma_orientation)
+    left = [residual_arrays(chain, each) for each in problem.sets]
     good = [
-        near | _not_gross(residual_arrays(chain, each), sigmas)
-        for near, each in zip(robust.inliers, problem.sets, strict=True)
+        near | _not_gross(each, sigmas) for near, each in zip(robust.inliers, left, strict=True)
     ]
     kept = system.select(good)
     normal = normal_equations(chain, names, kept)
@@ -68,9 +66,9 @@ def live_fit(problem: Problem, samples: Sequence[Sample], count: int) -> Update:
     out = [some[~near] for some, near in zip(members, good, strict=True)]
     gross = np.sort(np.concatenate(out)).tolist()
     spreads = np.array([each.spread for each in samples])
-    rms, ratio, given = _rms_residuals(
-        chain, problem.sets, [spreads[some] for some in members], good, sigmas[0]
-    )
+    rms, ratio, given = np.sqrt(
+        _mean_squares(problem, [spreads[some] for some in members], left, good)
+    ).tolist()
     estimate = Estimate(
         chain=chain,
         names=names,
@@ -100,20 +98,17 @@ def _not_gross(left: Sequence[FloatArray], sigmas: tuple[float, float]) -> Flags
     return (norms(position) <= OUTER * length) & ~(norms(turn) > OUTER * angle)
 
 
-def _rms_residuals(
-    chain: Chain,
-    sets: Sequence[Observations],
+def _mean_squares(
+    problem: Problem,
     spreads: Sequence[FloatArray],
+    residuals: Sequence[Sequence[FloatArray]],
     good: Sequence[Flags],
-    sigma: float,
-) -> tuple[float, float, float]:
-    """Return the RMS position residual [m], in units of the scatter, and the sigma given [m]."""
-    squares, ratios, given = [], [], []
-    for each, spread, near in zip(sets, spreads, good, strict=True):
-        left = residual_arrays(chain, each)[0]
-        scatter = np.trace(each.covariances((sigma, 1.0))[:, :3, :3], axis1=1, axis2=2) / 3.0
-        given.append(scatter[near])
-        squares.append((left**2).sum(axis=1)[near])
-        ratios.append(((left**2).mean(axis=1) / np.maximum(scatter, spread**2))[near])
-    first, second, third = (np.concatenate(each).mean() for each in (squares, ratios, given))
-    return math.sqrt(first), math.sqrt(second), math.sqrt(third)
+) -> FloatArray:
+    """Return the mean squares of position residuals [m], by their scatter, and as given [m]."""
+    found, sigmas = [], (problem.sigma_position, 1.0)
+    for each, spread, (left, *_), near in zip(problem.sets, spreads, residuals, good, strict=True):
+        scatter = np.trace(each.covariances(sigmas)[:, :3, :3], axis1=1, axis2=2) / 3.0
+        squares = (left**2).sum(axis=1)
+        ratios = (left**2).mean(axis=1) / np.maximum(scatter, spread**2)
+        found.append(np.array([squares, ratios, scatter])[:, near])
+    return np.asarray(np.concatenate(found, axis=1).mean(axis=1))
