@@ -56,7 +56,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure, motion
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.sample import Sample
@@ -135,9 +135,7 @@ def publisher(rates, namespace, frames):
 
 def angles(goals, begin, times):
     """Return joint values (N, n) of a smooth move after a stop."""
-    share = np.clip((times - begin - 0.5 * LEG) / (0.5 * LEG), 0.0, 1.0)
-    share = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-    return goals[0] + share[:, np.newaxis] * (goals[1] - goals[0])
+    return motion(goals, 0.5 * LEG, 0.5 * LEG)(times - begin)
 
 
 def header(wall, moment, frame_id=''):

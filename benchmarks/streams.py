@@ -24,7 +24,7 @@ import bench
 import numpy as np
 from cell_simulator import misfit
 
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure, motion
 from calib_ros.decision.reasons import Rule
 from calib_ros.errors import CalibrationError
 from calib_ros.kinematics import se3
@@ -56,7 +56,7 @@ class Session:
         self.rng = np.random.default_rng([number, 0])
         self.true = faulty(CHAIN, Cell(), self.rng)
         rate, self.stand, self.oriented = design
-        self.goals = CHAIN.random_joints(STOPS, self.rng)
+        self.motion = motion(CHAIN.random_joints(STOPS, self.rng), MOVE, self.stand)
         self.end = STOPS * (MOVE + self.stand)
         self.joint_times = np.arange(0.0, self.end + 0.4, 0.008)
         self.times = np.arange(0.003, self.end + 0.3, 1.0 / rate)
@@ -64,15 +64,6 @@ class Session:
         self.joints = self.motion(self.joint_times)
         self.seen_at = self.times  # when the device saw what it sends
         self.smoothing = 0.0
-
-    def motion(self, times):
-        """Return joint values (N, n): at each goal the arm stands, then it moves to the next."""
-        leg = np.clip((times / (MOVE + self.stand)).astype(int), 0, STOPS - 1)
-        share = (times - leg * (MOVE + self.stand) - self.stand) / MOVE
-        share = np.clip(share, 0.0, 1.0)[:, np.newaxis]
-        share = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-        ahead = self.goals[np.minimum(leg + 1, STOPS - 1)]
-        return self.goals[leg] + share * (ahead - self.goals[leg])
 
     def run(self, mode):
         """Return the error [mm] of an accepted calibration or None, and what was told."""

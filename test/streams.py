@@ -5,6 +5,7 @@
 import numpy as np
 import recorded
 
+from calib_ros.apply.simulation import motion
 from calib_ros.kinematics import se3
 from calib_ros.sampling.batches import feed
 from calib_ros.sampling.messages import JOINT_STATE
@@ -65,17 +66,7 @@ def transform(stamp_ns, position, child, rotation=None):
 
 def stops(configurations, move=1.0, stand=1.0):
     """Return a function of times (N,) [s]: joints that stand at each row for a while."""
-    period = move + stand
-
-    def joints(times):
-        times = np.asarray(times, dtype=float)
-        leg = np.clip((times / period).astype(int), 0, len(configurations) - 1)
-        share = np.clip((times - leg * period - stand) / move, 0.0, 1.0)[:, np.newaxis]
-        share = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-        ahead = np.minimum(leg + 1, len(configurations) - 1)
-        return configurations[leg] + share * (configurations[ahead] - configurations[leg])
-
-    return joints
+    return motion(configurations, move, stand)
 
 
 def sweep(count, rng, reach=1.0):

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,6 +74,25 @@ def measure(
     )
 
 
+def motion(
+    configurations: FloatArray, move: float, dwell: float
+) -> Callable[[FloatArray], FloatArray]:
+    """Return a function of times (N,) [s]: joint values (N, n) along configurations (K, n).
+
+    The arm stands there for `dwell` [s], and moves smoothly to the next one in `move` [s].
+    """
+    period, last = move + dwell, len(configurations) - 1
+
+    def joints(times: FloatArray) -> FloatArray:
+        leg = np.clip((np.asarray(times) / period).astype(int), 0, last)
+        share = np.clip((times - leg * period - dwell) / move, 0.0, 1.0)[:, np.newaxis]
+        share = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        step = configurations[np.minimum(leg + 1, last)] - configurations[leg]
+        return np.asarray(configurations[leg] + share * step)
+
+    return joints
+
+
 def drive(
     configurations: FloatArray, cell: Cell, start_ns: int
 ) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
@@ -83,12 +103,7 @@ def drive(
     """
     period = cell.move + cell.dwell
     times = np.arange(0.0, period * len(configurations), 1.0 / cell.joint_rate)
-    leg = np.minimum((times / period).astype(int), len(configurations) - 1)
-    share = np.clip((times - leg * period - cell.dwell) / cell.move, 0.0, 1.0)
-    share = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-    ahead = np.minimum(leg + 1, len(configurations) - 1)
-    step = configurations[ahead] - configurations[leg]
-    joints = configurations[leg] + share[:, None] * step
+    joints = motion(configurations, cell.move, cell.dwell)(times)
     within = cell.dwell * np.arange(1, cell.poses_per_dwell + 1) / (cell.poses_per_dwell + 1)
     pose_times = (np.arange(len(configurations))[:, None] * period + within).ravel()
     stamps, pose_stamps = (
