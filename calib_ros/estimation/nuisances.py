@@ -82,9 +82,7 @@ def nuisance_products(
     share = -(-system.count // most)
     few = system.spread(most)
     products = share * _products(chain, columns, few, nuisances)
-    extra = np.column_stack(system.separation_rows(chain, columns))
     own, count = len(columns) + 1, len(names)
-    products[:own, :own] += extra.T @ extra
     every = np.eye(len(products))
     row = {str(name): k for k, name in enumerate(columns)}
 
@@ -98,8 +96,11 @@ def nuisance_products(
     end = wobble.shape[1] * nuisances.kept
     kept = np.column_stack([arm, wobble[:, :end], strain, grown, left])
     mixing = np.column_stack([kept, scaled(nuisances.sizes), wobble[:, end:], smooth])
-    mixed = mixing.T @ (products / noise**2) @ mixing
     first, rest = np.s_[: kept.shape[1]], np.s_[kept.shape[1] :]
+    bars = np.column_stack(system.separation_rows(chain, columns)) @ mixing[:own]
+    if any(not (each.observations.socket or each.observations.plane) for each in system.sets):
+        bars[:, kept.shape[1] - 1 - grown.shape[1] : kept.shape[1] - 1] = 0.0  # true lengths
+    mixed = (mixing.T @ products @ mixing + bars.T @ bars) / noise**2
     doubtful = mixed[rest, rest]
     return NuisanceProducts(
         mixed[first, first], mixed[first, rest], doubtful + np.eye(len(doubtful))

@@ -222,9 +222,13 @@ def test_a_tracker_beside_a_socket_is_as_much_out_of_scale_as_alone(scale):
     rng = np.random.default_rng(0)
     seen = measure(true, true.random_joints(40, rng), rng, *NOISE)
     seen = replace(seen, positions=scale * seen.positions)
-    alone, beside = (
-        identify(Problem(IIWA, seen, more=more, **SIGMAS)).posterior
-        for more in ((), problem.sets[:1])
+    first, _, third = sets = problem.sets[:3]
+    places = [true.forward(each.joints)[:, :3, 3].mean(axis=0) for each in (first, third)]
+    bar = ((first.base, third.base, float(np.linalg.norm(places[1] - places[0]))),)
+    alone, beside, barred = (
+        identify(Problem(IIWA, seen, more=more, separations=apart, **SIGMAS)).posterior
+        for more, apart in (((), ()), (sets[:1], ()), (sets, bar))
     )
     assert beside.scale == pytest.approx(alone.scale, abs=1e-4)
     assert beside.rival[0] == pytest.approx(alone.rival[0], abs=1.0)
+    assert barred.scale == pytest.approx(scale - 1.0, abs=2e-4)  # not scaled with the tracker
