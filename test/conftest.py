@@ -34,6 +34,12 @@ def unsearched(monkeypatch):
 
 
 @pytest.fixture
+def single(monkeypatch):
+    """Let several mistakes at once not be looked for, which takes most of a search."""
+    monkeypatch.setattr('calib_ros.decision.mistakes._beam_search', lambda *_: None)
+
+
+@pytest.fixture
 def table(tmp_path):
     """Return the path of a table of what was measured of a UR5e."""
     from measured import measured, rows_of, write_csv

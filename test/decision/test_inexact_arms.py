@@ -31,7 +31,7 @@ def as_vectors(each):
         (as_vectors, '--euler ZYX, '),
     ],
 )
-def test_mistakes_are_named_although_the_arm_is_worse_than_faulty_ones(spoilt, remedy):
+def test_mistakes_are_named_although_the_arm_is_worse_than_faulty_ones(spoilt, remedy, single):
     found = diagnose(Problem(ARM, spoilt(seen_of(ARM))))
     assert remedy in str(found)
     assert 0.02 < found.corrected < 0.04

@@ -304,7 +304,9 @@ def test_what_is_called_at_last_holds(cell, recording, held, call):
 
 
 @pytest.mark.parametrize('largest_error', [1e-6, 0.01])
-def test_the_text_stays_beside_the_journal_of_its_poses(cell, recording, held, largest_error):
+def test_the_text_stays_beside_the_journal_of_its_poses(
+    unsearched, cell, recording, held, largest_error
+):
     """After a ~/clear meanwhile it was beside the next journal, as was the report."""
     release, problems = held
     cell.set_parameters({'largest_error': largest_error})
