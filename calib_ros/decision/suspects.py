@@ -32,6 +32,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention
 from calib_ros.kinematics.chain_file import shipped_chains, too_long
+from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import counted
 
 Rescaled: TypeAlias = Callable[[float], DataChange]
@@ -74,21 +75,25 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
             yield replace(each, remedy=remedy)
         return
     if not sets[0].socket:
-        (seen,) = sets
-        back = BACK * seen.seen
-        for each in _units(chain):
-            yield replace(each, part='measured', changes=(*back, *each.changes, *back))
-        if seen.oriented.any():
-            yield from (replace(each, part='measured') for each in _conventions(chain, seen))
-            yield from _misread(chain, seen)
-        else:
-            what, remedy = NOT_ON_FLANGE if seen.seen else ON_FLANGE
-            yield Suspect(what, remedy, BACK, published=_in_sources(not seen.seen))
-        yield from _of_coordinates(seen)
-        remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
-        what = 'the axes of the measuring device are left-handed'
-        yield Suspect(what, remedy, (*back, mirrored, *back), 3, part='handed')
+        back = BACK * sets[0].inverse  # to what was measured
+        for each in _of_poses(chain, sets[0]):
+            yield replace(each, changes=(*back, *each.changes, *back))
     yield from _arm_mistakes(chain, sets)
+
+
+def _of_poses(chain: Chain, seen: Observations) -> Iterator[Suspect]:
+    """Yield mistakes of what was measured."""
+    yield from (replace(each, part='measured') for each in _units(chain))
+    if seen.oriented.any():
+        yield from (replace(each, part='measured') for each in _conventions(chain, seen))
+        yield from _misread(chain, seen)
+    else:
+        what, remedy = NOT_ON_FLANGE if seen.seen else ON_FLANGE
+        yield Suspect(what, remedy, BACK, published=_in_sources(not seen.seen))
+    yield from _of_coordinates(seen)
+    remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
+    what = 'the axes of the measuring device are left-handed'
+    yield Suspect(what, remedy, (mirrored,), 3, part='handed')
 
 
 def _arm_mistakes(chain: Chain, sets: Sets) -> Iterator[Suspect]:
@@ -164,21 +169,18 @@ def _of_lengths(key: str, columns: Sequence[str], change: Rescaled) -> Iterator[
 
 def _of_coordinates(seen: Observations) -> Iterator[Suspect]:
     """Yield other axes of the positions alone, and units of one coordinate."""
-    back = BACK * seen.inverse
     for signs, order in product(product((1, -1), repeat=3), permutations(range(3))):
         if seen.oriented.any() and ({*signs} == {1}) != (order == (0, 1, 2)):
             matrix = np.diag(signs) @ np.eye(3)[[*order]]
             given = [f'{"-" * (n < 0)}{"xyz"[k]}' for n, k in zip(signs, order, strict=True)]
             option = '--columns x={},y={},z={}'.format(*given)
             what = f'the coordinates x, y, z of the positions are {", ".join(given)}'
-            changes = (*back, change_axes(matrix), *back)
             turned = bool(np.linalg.det(matrix) > 0.0)  # Euler angles' may look so
             if not np.array_equal(matrix, -np.eye(3)):  # as left-handed axes
+                changes = (change_axes(matrix),)
                 yield Suspect(what, option, changes, 3 - turned, part='measured')
     for k, name in enumerate('xyz'):
-        own = partial(scaled, axis=k)
-        for each in _of_lengths(f'{name} coordinates alone', name, own):
-            yield replace(each, changes=(*back, *each.changes, *back))
+        yield from _of_lengths(f'{name} coordinates alone', name, partial(scaled, axis=k))
 
 
 def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
@@ -186,40 +188,33 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
 
     Only if all poses have an orientation, a camera on the flange may have measured them.
     """
-    back = BACK * seen.inverse  # to the measured poses
     ways = [
         Suspect(
             'the quaternions are w x y z, not x y z w',
             '--quaternion wxyz',
-            (
-                map_rotations(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [1, 2, 3, 0]])),
-                *back,
-            ),
+            (map_rotations(lambda turns: se3.from_quat(np.roll(se3.to_quat(turns), -1, 1))),),
         ),
         Suspect(
             'the quaternions are x y z w, not w x y z',
             '--quaternion xyzw',
-            (
-                map_rotations(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [3, 0, 1, 2]])),
-                *back,
-            ),
+            (map_rotations(lambda turns: se3.from_quat(np.roll(se3.to_quat(turns), 1, 1))),),
         ),
         Suspect(
             'the rotations are transposed: they are of the device in the target',
             '--columns qx=-qx,qy=-qy,qz=-qz',
-            (map_rotations(lambda turns: np.swapaxes(turns, 1, 2)), *back),
+            (map_rotations(lambda turns: np.swapaxes(turns, 1, 2)),),
         ),
     ]
-    if back:
+    if seen.inverse:
         what = 'the poses are not of a fixed target seen from the flange'
-        ways.append(Suspect(what, NOT_ON_FLANGE[1], published=_in_sources(False)))
+        ways.append(Suspect(what, NOT_ON_FLANGE[1], BACK, published=_in_sources(False)))
     elif seen.oriented.all():
         what = 'the poses are of the world in the target, as from a camera on the flange'
         remedy = '--eye-in-hand (or --inverse, where the device stands)'
         ways.append(Suspect(what, remedy, BACK, published=_in_sources(True)))
     in_mm, degrees = scale_lengths(chain, 1e-3), scale_joints(chain, 'revolute', np.radians(1.0))
     for way in ways:
-        yield replace(way, changes=(*back, *way.changes))
+        yield way
         for units, option, others in (
             ('and the positions in mm', '--length mm', in_mm),
             ('and the joint values in degrees', '--joint-angle deg', (degrees,)),
@@ -233,8 +228,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
             if published != Suspect.published:
                 published += ', correct the rest in the publisher'
             what, remedy = f'{way.what}, {units}', f'{way.remedy} {option}'
-            changes = (*back, *others, *way.changes)
-            yield Suspect(what, remedy, changes, 2, published=published)
+            yield Suspect(what, remedy, (*others, *way.changes), 2, published=published)
 
 
 def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:
@@ -243,18 +237,16 @@ def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     Base and tool preserve the angle between two poses: it must equal that between the flanges.
     """
     arm = chain.forward(seen.joints)[seen.oriented, :3, :3]
+    measured = (seen.inverted() if seen.inverse else seen).rotations[seen.oriented]
     between = se3.angles_between(arm[:-1], arm[1:])
 
-    def away(each: Observations) -> float:
-        some = each.rotations[each.oriented]
-        return float(np.median(np.abs(se3.angles_between(some[:-1], some[1:]) - between)))
+    def away(turns: FloatArray) -> float:
+        return float(np.median(np.abs(se3.angles_between(turns[:-1], turns[1:]) - between)))
 
-    largest = NEARER * max(away(seen), float(np.median(between)))
-    back = BACK * seen.inverse
+    largest = NEARER * max(away(measured), float(np.median(between)))
     for what, remedy, turn in misread():
-        found = Suspect(what, remedy, (*back, map_rotations(turn), *back), 2)
-        if away(*found.undo_in((seen,))) < largest:
-            yield found
+        if away(turn(measured)) < largest:
+            yield Suspect(what, remedy, (map_rotations(turn),), 2)
 
 
 def _of_joints(chain: Chain, seen: Observations) -> Iterator[Suspect]:
