@@ -41,8 +41,8 @@ def cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Comparison
     by_fold = fitted.system.select(order), [*map(np.sort, numbers)]  # sorted once
     fits = (before, frames), (fitted.chain, names)
     chains = zip(*(leave_fold_out(one, some, *by_fold) for one, some in fits), strict=True)
-    first, second = fold_residuals(chains, problem.sets, groups, numbers)
-    judged = Comparison(first, second, ~fitted.robust.outliers)
+    pair = fold_residuals(chains, problem.sets, groups, numbers)
+    judged = Comparison(*pair, ~fitted.robust.outliers)
     over = f'{folds}-fold cross-validation over {count:,} different poses'
     return judged, f'{over}{note}{judged.omitted}'
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.decision.comparison import Comparison
-from calib_ros.decision.residuals import joined, residuals
+from calib_ros.decision.cross_validation import fold_residuals
 from calib_ros.estimation.arbitrary import drawn
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.identifiability import independent_in
@@ -67,10 +67,7 @@ def leave_one_place_out(
             rest = [name for name in wanted if name in kept and name not in own]
             found.append(minimise(minimise(chain, rest, others).chain, own, left).chain)
     number = {base: k for k, place in enumerate(places) for base in place}
-    groups = np.concatenate([np.full(len(each), number[each.base]) for each in problem.sets])
-    first, second = (
-        joined([residuals(side[number[each.base]], each) for each in problem.sets], groups)
-        for side in chains
-    )
-    judged = Comparison(first, second, ~fitted.robust.outliers)
+    groups = [np.full(len(each), number[each.base]) for each in problem.sets]
+    pair = fold_residuals(zip(*chains, strict=True), problem.sets, groups, groups)
+    judged = Comparison(*pair, ~fitted.robust.outliers)
     return judged, f'leaving out one of {len(places)} locations at a time{judged.omitted}'
