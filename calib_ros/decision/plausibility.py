@@ -69,10 +69,7 @@ def add_remarks(problem: Problem, result: Identification, another: bool = True) 
     late = any(each.rule is Rule.LAG for each in result.refusals)
     lens, imitated = _lens(problem, result) if another and not late else ('', False)
     board = '' if lens else stretched(problem, result)
-    sigmas, refusals = (
-        _sigmas(problem, result),
-        [*result.refusals, *scale_reasons(problem, result)],
-    )
+    refusals = [*result.refusals, *scale_reasons(problem, result)]
     if board and all(each.pixels is not None for each in problem.sets):
         refusals.insert(0, Reason(Rule.SCALE, board))  # before what follows for its size
         board = ''
@@ -81,6 +78,7 @@ def add_remarks(problem: Problem, result: Identification, another: bool = True) 
         lens = ''
     if another and (several := _sessions(problem, result)):
         refusals.append(Reason(Rule.MISTAKE, several))
+    sigmas = _sigmas(problem, result)
     if sigmas and refusals:
         refusals.append(Reason(Rule.MISTAKE, sigmas))
         sigmas = ''

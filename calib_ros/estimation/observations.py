@@ -125,10 +125,8 @@ class Observations(Shown):
         if joints.ndim != 2:
             raise InputError(f'joints must have the shape (N, n), not {joints.shape}')
         count, oriented = len(joints), rotations is not None
-        if rotations is not None:
-            turns = rotations.copy()
-        else:
-            turns = np.broadcast_to(np.eye(3), (count, 3, 3))
+        plain = np.broadcast_to(np.eye(3), (count, 3, 3))
+        turns = plain if rotations is None else rotations.copy()
         stamps = np.arange(1, count + 1, dtype=np.int64) * 1_000_000_000
         found = cls(stamps, joints, positions, turns, np.full(count, oriented))
         if oriented:

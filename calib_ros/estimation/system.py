@@ -122,8 +122,8 @@ def stacked(rows: Sequence[FloatArray]) -> FloatArray:
 
 def row_samples(rows: Sequence[FloatArray]) -> Index:
     """Return the sample number (R,), over all sets, of each row of `stacked`."""
-    ends = np.cumsum([each.shape[2] for each in rows]).tolist()
-    numbers = [np.arange(end - each.shape[2], end) for end, each in zip(ends, rows, strict=True)]
-    return np.concatenate(
-        [np.tile(each, part.shape[1]) for each, part in zip(numbers, rows, strict=True)]
-    )
+    found, first = list[Index](), 0
+    for _, width, count in (each.shape for each in rows):
+        found.append(np.tile(np.arange(first, first + count), width))
+        first += count
+    return np.concatenate(found)

@@ -109,10 +109,8 @@ def _in_frames_of(nominal: Chain, chain: Chain) -> Iterator[Chain]:
     turns = Rotation.from_rotvec([[0.0, 0.0, k * np.pi / 2.0] for k in range(4)]).as_matrix()
     ways = [turns * [1.0, joint.sign, joint.sign] for joint in (chain.joints[0], chain.joints[-1])]
     for first, last in product(*(se3.transform(each, np.zeros((4, 3))) for each in ways)):
-        base, tool = (
-            nominal.frame('base').matrix @ first,
-            se3.invert(last) @ nominal.frame('tool').matrix,
-        )
+        base = nominal.frame('base').matrix @ first
+        tool = se3.invert(last) @ nominal.frame('tool').matrix
         yield replace(chain, base=Frame(base), tool=Frame(tool), frames=())
 
 

@@ -155,11 +155,9 @@ class Follower:
             task = task._replace(held=held, start=np.where(held, np.clip(x, lower, upper), 0.0))
             again = self._attempt(task.select(rest))
             x[:, rest], errors[rest], converged[rest], damped[rest] = again
-        return Solution(
-            (self._unit * x).T,
-            *(errors[:, 0], errors[:, 1], errors[:, 2], before[:, 0], before[:, 1]),
-            *(converged, (task.held & ~never).T, damped),
-        )
+        limited = (task.held & ~never).T
+        found = (*errors.T, *before.T[:2], converged, limited, damped)
+        return Solution((self._unit * x).T, *found)
 
     def _attempt(self, task: _Task) -> tuple[FloatArray, FloatArray, Flags, Flags]:
         """Return x (n, B), errors (B, 3), convergence and damping (B,).
