@@ -123,16 +123,14 @@ def _rows(fitted: Fitted, wires: Sequence[str]) -> tuple[list[FloatArray], int, 
     names = list(dict.fromkeys([*fitted.names, *placed]))
     sags = [n for n in effects.members(problem.chain, 'gravity') if n not in names]
     sane = {n: problem.common_sense(n) for n in names if not problem.model.owns_frame(n)}
-    system, chain = replace(problem, learned=Learned(sane)).system(sets), fitted.chain
+    usual = replace(problem, learned=Learned(sane), effects=(*problem.effects, *sags))
+    system, chain = usual.system(sets), fitted.chain
     bent = chain.with_effects(sags)
     rows = system.rows_of(bent, [*names, *sags])
     for k, samples in enumerate(system.sets):
         rows[k] = with_terms(rows[k], samples, wires, _terms(chain, samples.observations))
     given, back = system.extra_rows(bent, [*names, *sags])
-    usual = np.diag([1.0 / effects.expected(name) for name in sags])
-    known = np.zeros((len(given) + len(sags), len(names) + len(sags) + TERMS * len(wires) + 1))
-    known[: len(given), : given.shape[1]], known[: len(given), -1] = given, back
-    known[len(given) :, len(names) : given.shape[1]] = usual
+    known = np.column_stack([given, np.zeros((len(given), TERMS * len(wires))), back])
     return [stacked(rows), known], len(names), len(sags)
 
 
