@@ -28,7 +28,7 @@ from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import residual_arrays
-from calib_ros.estimation.start import in_new_frames, released
+from calib_ros.estimation.start import in_new_frames, reframed
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -78,7 +78,7 @@ def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str
     """
     if not fitted:
         return chain
-    chain = released(chain, fitted)
+    chain = reframed(chain, fitted, fixed=False)
     plain = [replace(s, oriented=np.zeros_like(s.oriented), covariance=None) for s in sets]
     problem = Problem(chain, plain[0], more=plain[1:], loss='none')
     chain = in_new_frames(problem, chain, fitted, problem.system(plain), needed=False)

@@ -51,7 +51,7 @@ from calib_ros.estimation.levels import (
 )
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.start import flange
+from calib_ros.estimation.start import flange, reframed
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import norms
@@ -172,8 +172,7 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Diagnosis | 
     rows = np.flatnonzero(far)
     if len(rows) < LEAST_ASIDE:
         return None
-    for name in (seen.base, seen.tool):
-        chain = chain.with_frame(name, replace(chain.frame(name), fixed=True))
+    chain = reframed(chain, (seen.base, seen.tool), fixed=True)
     given = trial_of(chain, (seen.select(rows).spread(),))
     found = _named(problem, given, _best_trials(problem, chain, given.sets, given, of_rows=True))
     if found is None or len(rows) == len(seen):

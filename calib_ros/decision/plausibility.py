@@ -33,7 +33,7 @@ from calib_ros.estimation.levels import ALIKE, CLEARLY, NEARER, SURE, TELLING, c
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.sizes import TYPICAL
-from calib_ros.estimation.start import fit_to_arm
+from calib_ros.estimation.start import fit_to_arm, reframed
 from calib_ros.estimation.weights import OUTLIER
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -248,8 +248,7 @@ def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | 
         with suppress(InputError, np.linalg.LinAlgError):
             given = fit(replace(problem, fixed=(*problem.fixed, *lens)))
             chain, names = given.chain, given.names
-    for name in bases:
-        chain = chain.with_frame(name, replace(chain.frame(name), delay=0.0))
+    chain = reframed(chain, bases, delay=0.0)
     sets = [*map(_with_moves, problem.sets)]
     few = [each.spread() for each in sets]
     shares = [

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -80,9 +81,7 @@ def in_new_frames(
 
     Raises InputError if these do not show where the frames are, if that is `needed`.
     """
-    known = arm
-    for name in arm.frame_names:
-        known = known.with_frame(name, replace(arm.frame(name), fixed=name not in new))
+    known = reframed(reframed(arm, arm.frame_names, fixed=True), new, fixed=False)
     own = movable(known, new)
     found = start_frames(replace(problem, chain=known))
     if needed:
@@ -94,10 +93,10 @@ def in_new_frames(
     return arm
 
 
-def released(chain: Chain, names: Iterable[str]) -> Chain:
-    """Return the chain with frames that are not fixed."""
+def reframed(chain: Chain, names: Iterable[str], **changes: Any) -> Chain:
+    """Return the chain with other values of some fields of its named frames."""
     for name in names:
-        chain = chain.with_frame(name, replace(chain.frame(name), fixed=False))
+        chain = chain.with_frame(name, replace(chain.frame(name), **changes))
     return chain
 
 

@@ -41,7 +41,7 @@ from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.start import released
+from calib_ros.estimation.start import reframed
 from calib_ros.identification import records
 from calib_ros.identification.age import recorded_time
 from calib_ros.identification.fingerprint import Fingerprint
@@ -256,7 +256,7 @@ class Calibration(Shown):
         """Return what moved while new measurements were taken, if that explains most errors."""
         chain = self.chain
         arm = tuple(name for name in chain.parameter_names if not chain.owns_frame(name))
-        chain = released(chain, chain.frame_names)
+        chain = reframed(chain, chain.frame_names, fixed=False)
         try:
             fitted = fit(Problem(chain, sets[0], more=tuple(sets[1:]), fixed=arm))
         except InputError:  # too few for frames of their own

@@ -37,7 +37,7 @@ from calib_ros.estimation.normal import products_of
 from calib_ros.estimation.nuisances import Nuisances, nuisance_products
 from calib_ros.estimation.observations import SOME_POSES, Observations, frames_of_sets, numbered
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.start import in_new_frames, released
+from calib_ros.estimation.start import in_new_frames, reframed
 from calib_ros.estimation.system import System
 from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.age import drift_of, recorded_time
@@ -72,7 +72,7 @@ def recalibrate(
     previous.require_frames(problem.all_sets)
     previous = _released(previous, new)
     ours = [name for name in new if name in problem.chain.frame_names]
-    problem = replace(problem, chain=released(problem.chain, ours))
+    problem = replace(problem, chain=reframed(problem.chain, ours, fixed=False))
     if mistake := mistakes.diagnose(problem, far=True):
         raise InputError(f'the new poses do not fit the arm: {mistake}')
     problem = _with_noise(problem, previous, stated)
@@ -114,8 +114,9 @@ def _released(previous: Calibration, new: Sequence[str]) -> Calibration:
     """Return a calibration whose new frames are not fixed where they were."""
     region = previous.region
     if region is not None:
-        region = replace(region, chain=released(region.chain, new))
-    chain, before = released(previous.chain, new), released(previous.before, new)
+        region = replace(region, chain=reframed(region.chain, new, fixed=False))
+    arms = previous.chain, previous.before
+    chain, before = (reframed(each, new, fixed=False) for each in arms)
     return replace(previous, chain=chain, before=before, region=region)
 
 
