@@ -95,9 +95,8 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
                 by_kind[kind].setdefault(part, []).append((length, size))
     for part, own in by_kind['near'].items():
         middles[part] += faded_near(even, part, own, share)
-    for part, middle in faded_in_succession(
-        fit.chain, names, system, by_kind['successive']
-    ).items():
+    successive = faded_in_succession(fit.chain, names, system, by_kind['successive'])
+    for part, middle in successive.items():
         middles[part] += middle
     found = tuple(kind for kind in kinds if any(kind in each for each in alike.values()))
     return Shared(**correlations, found=found, middles=middles)

@@ -63,11 +63,8 @@ def trimmed_sum(chain: Chain, system: System) -> float:
 
 def squared_residuals(chain: Chain, system: System) -> FloatArray:
     """Return the squared residuals (N,) of the samples of all sets, in sigma."""
-    found = []
-    for samples in system.sets:
-        parts = [np.nan_to_num(part) for part in samples.whitened_residuals(chain)]
-        found.append(sum((part**2).sum(axis=1) for part in parts))
-    return np.concatenate(found)
+    sets = (map(np.nan_to_num, samples.whitened_residuals(chain)) for samples in system.sets)
+    return np.concatenate([sum((part**2).sum(axis=1) for part in parts) for parts in sets])
 
 
 def _thinned(system: System) -> System:
