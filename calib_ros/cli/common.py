@@ -112,11 +112,6 @@ def settings_of(options: argparse.Namespace) -> Settings:
     return Settings(**given)
 
 
-def sessions_of(options: argparse.Namespace) -> tuple[str, ...]:
-    """Return the wanted sessions of a table."""
-    return tuple(options.session.split(',')) if options.session else ()
-
-
 @contextmanager
 def output_files(options: argparse.Namespace, names: Sequence[str]) -> Iterator[Contents]:
     """Yield the files of --out, to be filled in; they are written at the end, all or none.

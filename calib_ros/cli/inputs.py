@@ -10,14 +10,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TypeAlias
 
-from calib_ros.cli.common import (
-    LAYOUT_OPTIONS,
-    OF_REPORTS,
-    OF_TABLES,
-    Contents,
-    sessions_of,
-    settings_of,
-)
+from calib_ros.cli.common import LAYOUT_OPTIONS, OF_REPORTS, OF_TABLES, Contents, settings_of
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -144,6 +137,6 @@ def table_of(
 ) -> Dataset:
     """Return a table of measurements with the layout of the options."""
     foreign = foreign_of(options, chain)
-    sessions = sessions_of(options)
+    sessions = options.session.split(',') if options.session else ()
     with screen.work(f'reading {path.name}') as work:
         return loading.table(path, chain, settings, sessions, eye_in_hand, foreign, work)

@@ -13,11 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calib_ros.atomic import given_path
-from calib_ros.errors import (
-    MOST_ENTRIES,
-    CalibrationError,
-    ConfigError,
-)
+from calib_ros.errors import MOST_ENTRIES, CalibrationError, ConfigError
 from calib_ros.files.boards import read_board
 from calib_ros.files.detector import Detector
 from calib_ros.files.images import image_of

@@ -10,9 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from calib_ros.errors import InputError
-from calib_ros.files.vocabulary import (
-    SHEETS,
-)
+from calib_ros.files.vocabulary import SHEETS
 from calib_ros.texts import LARGEST_TABLE, read_bytes
 
 WESTERN = ('Windows-1252', 'Latin-1')  # the last has all bytes

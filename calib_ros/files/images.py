@@ -11,11 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import (
-    CalibrationError,
-    InputError,
-    UnknownNameError,
-)
+from calib_ros.errors import CalibrationError, InputError, UnknownNameError
 from calib_ros.files.detector import Image, opencv
 from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.sampling.board_finder import Flaw

@@ -13,7 +13,6 @@ import codecs
 import csv
 import errno
 import fcntl
-import io
 import json
 import os
 from collections.abc import Iterator, Sequence
@@ -135,9 +134,8 @@ def _of_sample(sample: Sample, removed: bool) -> bytes:
 
 
 def _line(row: Sequence[str]) -> bytes:
-    text = io.StringIO()
-    csv.writer(text).writerow(row)  # its line end makes it quote names with any
-    return text.getvalue().removesuffix('\r\n').encode() + b'\n'
+    text = csv_text([row], end='\r\n')  # which makes csv quote names with any line end
+    return text.removesuffix('\r\n').encode() + b'\n'
 
 
 def settings_beside(path: Path) -> Path:

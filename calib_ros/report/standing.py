@@ -21,10 +21,7 @@ ACTIVE = 'Check that the correction is active in the controller.'
 TOLERANCE = 'For PASS or FAIL, give --tolerance, the RMS error [mm] that your task allows.'
 ARCHIVE = 'Keep this page with the calibration. Verify again after a collision or repair.'
 STANDINGS: dict[str, tuple[Headline, tuple[str, ...]]] = {
-    'PASS': (
-        Headline('good', 'PASS: the arm is within the tolerance'),
-        (ARCHIVE,),
-    ),
+    'PASS': (Headline('good', 'PASS: the arm is within the tolerance'), (ARCHIVE,)),
     'FAIL': (
         Headline('bad', 'FAIL: the arm exceeds the tolerance'),
         (SOMETHING_MOVED, ACTIVE, 'Calibrate again with new poses; try --model auto.'),
