@@ -32,10 +32,14 @@ def options(words, **known):
 
 
 def tell(found, as_json):
-    """Print figures by name as JSON, or as lines and tables: a row for each that has several."""
+    """Print figures by name as JSON, or as lines and tables.
+
+    A row for each name that has several, or for each of a list, by the first of them.
+    """
     if as_json:
         print(json.dumps(found, indent=1))
         return
+    found = {name: by_first(each) for name, each in found.items()}
     rows = {name: each for name, each in found.items() if isinstance(each, dict)}
     for name, each in found.items():
         if name not in rows:
@@ -80,6 +84,21 @@ def distances(chain, true, joints):
 def rms(values):
     """Return the root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
+
+
+def by_first(value):
+    """Return a list of rows by the first figure of each; anything else as it is."""
+    if not isinstance(value, list) or not all(isinstance(row, dict) for row in value):
+        return value
+    rows = ([*row.items()] for row in value)
+    return {str(first): dict(rest) for (_, first), *rest in rows}
+
+
+def within(result, q, error):
+    """Tell (N,) whether errors (N, 3) of positions are within the 95 % ellipsoids."""
+    axes = result.confidence_ellipsoid(q)
+    along = np.einsum('nij,nj->ni', axes, error) / (axes**2).sum(axis=2)
+    return (along**2).sum(axis=1) <= 1.0
 
 
 def cell(value):

@@ -11,6 +11,7 @@ and axes wobble: they tilt about x and y by amplitude sin(order q + phase).
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import bench
@@ -283,28 +284,35 @@ def lines(arm, count, rng):
         corners = place + rng.uniform(-0.5 * LINKS, 0.5 * LINKS, (5, 3))
         along = np.linspace(0.0, 4.0, 2 * count)
         wanted = np.stack([np.interp(along, np.arange(5), c) for c in corners.T], axis=1)
-        q = np.tile(home, (len(wanted), 1))
-        for _ in range(30):
-            error = _twist(wanted, rotation, *plain.forward(q))
-            slopes = []
-            for i in range(q.shape[1]):
-                ahead = q.copy()
-                ahead[:, i] += 1e-6
-                slopes.append((error - _twist(wanted, rotation, *plain.forward(ahead))) / 1e-6)
-            jacobian = np.stack(slopes, axis=2)
-            back = np.swapaxes(jacobian, 1, 2)
-            normal = jacobian @ back + 1e-8 * np.eye(6)
-            step = (back @ np.linalg.solve(normal, error[:, :, None]))[:, :, 0]
-            q = q + np.clip(step, -0.3, 0.3)
-        error = np.abs(_twist(wanted, rotation, *plain.forward(q))).max(axis=1)
-        inside = ((q >= arm.limits[:, 0]) & (q <= arm.limits[:, 1])).all(axis=1)
-        kept = q[(error < 1e-7) & inside]
+        start = np.tile(home, (len(wanted), 1))
+        missing = partial(_missing, plain, wanted, rotation)
+        kept = led(plain, start, lambda q, _, left=missing: left(q), 1e-8)
         if len(kept) >= count:
             return kept[np.sort(rng.choice(len(kept), count, replace=False))]
     raise SystemExit('no lines of constant orientation found')
 
 
-def _twist(wanted, rotation, turned, place):
+def _missing(arm, wanted, rotation, q):
     """Return what is missing (N, 6) [m, rad] to the wanted places at one orientation."""
-    missing = rotation @ np.swapaxes(turned, 1, 2)
-    return np.hstack([wanted - place, Rotation.from_matrix(missing).as_rotvec()])
+    turned, place = arm.forward(q)
+    turn = Rotation.from_matrix(rotation @ np.swapaxes(turned, 1, 2)).as_rotvec()
+    return np.hstack([place - wanted, -turn])
+
+
+def led(arm, start, left, damping=1e-10):
+    """Return those joint values near `start` (N, n) that make what is `left` (N, c) vanish."""
+    q, numbers = start, np.arange(len(start))
+    for _ in range(40):
+        here = left(q, numbers)
+        slopes = []
+        for i in range(q.shape[1]):
+            ahead = q.copy()
+            ahead[:, i] += 1e-6
+            slopes.append((left(ahead, numbers) - here) / 1e-6)
+        jacobian = np.stack(slopes, axis=2)
+        back = np.swapaxes(jacobian, 1, 2)
+        normal = jacobian @ back + damping * np.eye(here.shape[1])
+        step = (back @ np.linalg.solve(normal, -here[:, :, None]))[:, :, 0]
+        q = q + np.clip(step, -0.3, 0.3)
+    inside = ((q >= arm.limits[:, 0]) & (q <= arm.limits[:, 1])).all(axis=1)
+    return q[inside & (np.abs(left(q, numbers)).max(axis=1) < 1e-7)]

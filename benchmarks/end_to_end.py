@@ -12,7 +12,6 @@ table of positions (500,000 rows, --quick 50,000), a bag of stops (11,911, 1,000
 
 import contextlib
 import io
-import json
 import tempfile
 from pathlib import Path
 
@@ -87,7 +86,7 @@ def cases(folder, quick):
 
 
 def main():
-    """Print a line for each case."""
+    """Measure all cases and print."""
     options = bench.options(__doc__, quick=False, json=False)
     figures = []
     with tempfile.TemporaryDirectory() as name:
@@ -95,10 +94,7 @@ def main():
         for what, run, observations, times in cases(Path(name), options.quick):
             ours, bare = cpu(run, times), cpu(bare_fit(observations), 3)
             figures.append({'case': what, 'cpu_s': ours, 'bare_fit_s': bare, 'ratio': ours / bare})
-            if not options.json:
-                print(f'{what:24} {ours:8.3f} s, bare fit {bare:8.4f} s, ratio {ours / bare:7.1f}')
-    if options.json:
-        print(json.dumps({'machine': machine(), 'figures': figures}, indent=2))
+    bench.tell({'machine': machine(), 'figures': figures}, options.json)
 
 
 if __name__ == '__main__':

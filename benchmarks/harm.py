@@ -141,10 +141,7 @@ def other_half(result, one, rng):
     if not len(q):
         return {'beyond': 0, 'held': 0}
     error = one.arm.forward(q)[1] - result.chain.forward(q)[:, :3, 3]
-    axes = result.confidence_ellipsoid(q)
-    square = np.sum(axes**2, axis=2)
-    along = np.einsum('nki,ni->nk', axes, error) / square
-    return {'beyond': len(q), 'held': int(np.sum(np.sum(along**2, axis=1) <= 1.0))}
+    return {'beyond': len(q), 'held': int(bench.within(result, q, error).sum())}
 
 
 def compensated(result, one, q):

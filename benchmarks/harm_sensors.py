@@ -10,6 +10,7 @@ half a metre; its lens is fitted from values that are off by 1 %.
 from dataclasses import replace
 
 import numpy as np
+from cell_simulator import led
 from scipy.spatial.transform import Rotation
 
 from calib_ros.estimation.observations import Observations
@@ -22,25 +23,6 @@ NOISE_OF_PIXELS = 0.3
 CORNERS = np.array([(0.03 * i, 0.03 * j, 0.0) for j in range(5) for i in range(8)])
 LENS = {'fx': 900.0, 'fy': 902.0, 'cx': 640.0, 'cy': 360.0, 'k1': -0.1, 'k2': 0.05}
 TOLD = Lens(908.0, 896.0, 645.0, 353.0, -0.08, 0.02, fixed=False)
-
-
-def led(arm, start, left):
-    """Return those joint values near `start` (N, n) that make what is `left` (N, c) vanish."""
-    q, numbers = start, np.arange(len(start))
-    for _ in range(40):
-        here = left(q, numbers)
-        slopes = []
-        for i in range(q.shape[1]):
-            ahead = q.copy()
-            ahead[:, i] += 1e-6
-            slopes.append((left(ahead, numbers) - here) / 1e-6)
-        jacobian = np.stack(slopes, axis=2)
-        back = np.swapaxes(jacobian, 1, 2)
-        normal = jacobian @ back + 1e-10 * np.eye(here.shape[1])
-        step = (back @ np.linalg.solve(normal, -here[:, :, None]))[:, :, 0]
-        q = q + np.clip(step, -0.3, 0.3)
-    inside = ((q >= arm.limits[:, 0]) & (q <= arm.limits[:, 1])).all(axis=1)
-    return q[inside & (np.abs(left(q, numbers)).max(axis=1) < 1e-7)]
 
 
 def place_of(arm, rng):

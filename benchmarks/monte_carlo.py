@@ -59,7 +59,7 @@ def one_run(nominal, seed, oriented, poses, told=1.0):
     deviation, hits = off(result, true)
     unseen = nominal.random_joints(50, rng)
     error = (result.chain.forward(unseen) - true.forward(unseen))[:, :3, 3]
-    return deviation**2 / np.diag(bound), hits, within(result, unseen, error)
+    return deviation**2 / np.diag(bound), hits, bench.within(result, unseen, error)
 
 
 def off(result, true):
@@ -125,17 +125,10 @@ def incomplete(nominal, kind, seed, poses=60):
     error -= moved(unseen, rng.choice([-1.0, 1.0], unseen.shape))[:, :3]
     stated = np.trace(result.pose_covariance(unseen)[:, :3, :3], axis1=1, axis2=2).mean()
     actual = np.mean((error**2).sum(axis=1))
-    hits = off(result, true)[1], within(result, unseen, error)
+    hits = off(result, true)[1], bench.within(result, unseen, error)
     regions = [session(rng.uniform(-2.0, 2.0, len(true.joints))) for _ in range(2)]
     apart = not difference(*map(Calibration.of, regions)).same
     return *hits, claimed, apart, np.sqrt(actual), np.sqrt(stated)
-
-
-def within(result, q, error):
-    """Tell (N,) whether errors (N, 3) of positions are within the 95 % ellipsoids."""
-    axes = result.confidence_ellipsoid(q)
-    along = np.einsum('nij,nj->ni', axes, error) / (axes**2).sum(axis=2)
-    return (along**2).sum(axis=1) <= 1.0
 
 
 def main():

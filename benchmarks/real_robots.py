@@ -16,7 +16,6 @@ time, and a Gaussian process on the joint angles, all fitted to the residuals of
 """
 
 import csv
-import json
 import time
 from dataclasses import replace
 
@@ -69,14 +68,6 @@ def row(label, figures, result, seconds):
     }
 
 
-def held(unseen, result):
-    """Return the share of measured positions within the 95 % ellipsoids of predicted ones."""
-    axes = result.confidence_ellipsoid(unseen.joints)
-    error = unseen.positions - result.chain.forward(unseen.joints)[:, :3, 3]
-    along = np.einsum('nij,nj->ni', axes, error) / (axes**2).sum(axis=2)
-    return float(np.mean((along**2).sum(axis=1) <= 1.0))
-
-
 def rows_of(problem):
     """Yield the lines of one data set."""
     begin = time.perf_counter()
@@ -85,7 +76,9 @@ def rows_of(problem):
     yield row('nominal', result.validation.figures[0], result, 0.0)
     line = row('geometric', result.validation.figures[1], result, seconds)
     if problem.judging and not problem.judging[0].inverse:
-        line['within_95'] = held(problem.judging[0], result)
+        unseen = problem.judging[0]
+        error = unseen.positions - result.chain.forward(unseen.joints)[:, :3, 3]
+        line['within_95'] = float(bench.within(result, unseen.joints, error).mean())
     yield line
     plain = identify(replace(problem, loss='none'))
     yield row('geometric, plain', plain.validation.figures[1], plain, 0.0)
@@ -233,33 +226,9 @@ def main():
             'published_mean_mm': published,
             'models': lines,
         }
-        if options.json:
-            continue
-        print(f'{name} {session} (reference {reference:.3f} mm)')
-        for line in lines:
-            print(
-                f'  {line["model"]:18} RMS {line["rms_mm"]:7.3f}  mean {line["mean_mm"]:7.3f}  '
-                f'max {line["max_mm"]:7.3f} mm  {line["parameters"]:3} parameters  '
-                f'{"accepted" if line["accepted"] else "NOT accepted":12} {line["seconds"]:5.2f} s'
-            )
-        if 'within_95' in lines[1]:
-            print(
-                f'  held-out rows within the 95 % ellipsoids: {100 * lines[1]["within_95"]:.1f} %'
-            )
-        if 'chosen' in lines[-1]:
-            print(f'  chosen: {"; ".join(lines[-1]["chosen"]) or "nothing"}')
-        if published:
-            print('  published: mean {} -> {} mm ({})'.format(*published))
     found['transfer'] = list(transfer())
     found['tried'] = {session: list(tried(session)) for session in 'AB'}
-    if options.json:
-        print(json.dumps(found, indent=2))
-        return
-    for what, rms_mm, max_mm in found['transfer']:
-        print(f'UR10 {what:20} RMS {rms_mm:7.3f}  max {max_mm:7.3f} mm')
-    for session, lines in found['tried'].items():
-        for what, rms_mm in lines:
-            print(f'UR10 {session} {what:40} RMS {rms_mm:7.3f} mm')
+    bench.tell(found, options.json)
 
 
 if __name__ == '__main__':

@@ -10,7 +10,6 @@ target and split, rotations of quaternions, every number within its limits. `for
 table in millimetres and degrees with decimal commas.
 """
 
-import json
 import tempfile
 from pathlib import Path
 
@@ -82,13 +81,7 @@ def main():
             )
             row = {'table': kind, 'rows': options.rows, 'read_table_s': ours, 'loadtxt_s': theirs}
             found.append(row | {'ratio': ours / theirs})
-            if not options.json:
-                print(
-                    f'{kind:9} {options.rows} rows: read_table {ours:.2f} s, loadtxt {theirs:.2f} '
-                    f's, ratio {ours / theirs:.2f}'
-                )
-    if options.json:
-        print(json.dumps(found, indent=2))
+    bench.tell({'tables': found}, options.json)
 
 
 if __name__ == '__main__':
