@@ -98,122 +98,78 @@ def mixed_up(problem):
     return problem.with_sets(sets, held_out=None)
 
 
+def both(size, angle=1.0):
+    """Return a change of the observations by the units of positions and joint values."""
+    return lambda each: replace(each, positions=size * each.positions, joints=angle * each.joints)
+
+
+OF_ORIENTATIONS = (
+    ('wxyz', 'are w x y z', turned(lambda q: q[:, [3, 0, 1, 2]])),
+    ('xyzw read as wxyz', 'are x y z w', turned(lambda q: q[:, [1, 2, 3, 0]])),
+    (
+        *('transposed', 'transposed'),
+        lambda each: replace(each, rotations=np.swapaxes(each.rotations, 1, 2)),
+    ),
+    (
+        *('inverse pose, eye in hand not given', 'world in the target'),
+        lambda each: replace(each.inverted(), inverse=False),
+    ),
+    ('eye in hand given needlessly', 'not of a fixed target', lambda each: each.inverted()),
+    ('Euler order', 'angles are ZYX (xyz about fixed axes), not', rewritten('XYZ', 'ZYX')),
+    ('Euler order', 'angles are XYZ (zyx about fixed axes), not', rewritten('ZYX', 'XYZ')),
+    ('Euler order', 'angles are ZXY (yxz about fixed axes), not', rewritten('XYZ', 'ZXY')),
+    ('Euler order and columns', 'in the order of', rewritten('ZYX', 'XYZ', True)),
+    ('rotation vectors read as Euler angles', 'are rotation vec', rewritten('ZYX', None)),
+    ('Euler angles read as rotation vectors', 'not rotation vec', rewritten(None, 'ZYX')),
+    ('radians read as degrees', 'in radians, not', rewritten('ZYX', 'ZYX', size=np.pi / 180)),
+    ('degrees read as radians', 'orientations do', rewritten('ZYX', 'ZYX', size=180 / np.pi)),
+)
+
+
 def spoilt(problem):
     """Yield mistakes: group, words that name it, and the problem with it (None: cannot be)."""
-    chain = problem.chain
-    count = len(chain.joints)
-    names = chain.joint_names
-    seen = problem.observations
-    oriented, measured = bool(seen.oriented.all()), not seen.socket
-
-    def with_(change, can=True):
-        return changed(problem, change) if can else None
-
-    def both(each, size, angle=1.0):
-        return replace(each, positions=size * each.positions, joints=angle * each.joints)
-
-    for unit, name, size in suspects.UNITS:
-        yield (
-            unit,
-            f'positions are in {name},',
-            with_(lambda e, size=size: both(e, 1.0 / size), measured),
-        )
-    yield 'degrees', 'in degrees,', with_(joints(np.degrees))
-    yield (
-        'mm and degrees',
-        'in mm, not metres and the joint values in degrees',
-        with_(lambda e: both(e, 1e3, 180.0 / np.pi), measured),
-    )
-    yield (
-        'wxyz',
-        'are w x y z',
-        with_(turned(lambda q: q[:, [3, 0, 1, 2]]), measured and oriented),
-    )
-    yield (
-        'xyzw read as wxyz',
-        'are x y z w',
-        with_(turned(lambda q: q[:, [1, 2, 3, 0]]), measured and oriented),
-    )
-    yield (
-        'transposed',
-        'transposed',
-        with_(
-            lambda e: replace(e, rotations=np.swapaxes(e.rotations, 1, 2)), measured and oriented
+    chain, seen = problem.chain, problem.observations
+    names, unit = chain.joint_names, np.eye(len(chain.joints))
+    count, placed = len(names), not seen.socket
+    posed = placed and bool(seen.oriented.all())
+    for can, group, words, change in (
+        *(
+            (placed, kind, f'positions are in {name},', both(1.0 / size))
+            for kind, name, size in suspects.UNITS
         ),
-    )
-    yield (
-        'inverse pose, eye in hand not given',
-        'world in the target',
-        with_(lambda e: replace(e.inverted(), inverse=False), measured and oriented),
-    )
-    yield (
-        'eye in hand given needlessly',
-        'not of a fixed target',
-        with_(lambda e: e.inverted(), measured and oriented),
-    )
-    for group, words, change in (
-        ('Euler order', 'angles are ZYX (xyz about fixed axes), not', rewritten('XYZ', 'ZYX')),
-        ('Euler order', 'angles are XYZ (zyx about fixed axes), not', rewritten('ZYX', 'XYZ')),
-        ('Euler order', 'angles are ZXY (yxz about fixed axes), not', rewritten('XYZ', 'ZXY')),
-        ('Euler order and columns', 'in the order of', rewritten('ZYX', 'XYZ', True)),
-        ('rotation vectors read as Euler angles', 'are rotation vec', rewritten('ZYX', None)),
-        ('Euler angles read as rotation vectors', 'not rotation vec', rewritten(None, 'ZYX')),
-        ('radians read as degrees', 'in radians, not', rewritten('ZYX', 'ZYX', size=np.pi / 180)),
-        ('degrees read as radians', 'orientations do', rewritten('ZYX', 'ZYX', size=180 / np.pi)),
+        (True, 'degrees', 'in degrees,', joints(np.degrees)),
+        (
+            *(placed, 'mm and degrees', 'in mm, not metres and the joint values in degrees'),
+            both(1e3, 180.0 / np.pi),
+        ),
+        *((posed, *each) for each in OF_ORIENTATIONS),
+        (placed, 'left-handed', 'left-handed', undoing.mirrored),
     ):
-        yield group, words, with_(change, measured and oriented)
-    yield 'left-handed', 'left-handed', with_(undoing.mirrored, measured)
-    for k in range(count):
-        signs = np.ones(count)
-        signs[k] = -1.0
-        yield (
-            'sign of a joint',
-            f'{names[k]} counts the other way',
-            with_(joints(lambda q, signs=signs: signs * q)),
-        )
+        yield group, words, changed(problem, change) if can else None
+
+    def moved(matrix, zero=0.0):
+        return changed(problem, joints(lambda q: q @ matrix.T + zero))
+
+    for k, name in enumerate(names):
+        flipped = unit - 2.0 * np.diag(unit[k])
+        yield 'sign of a joint', f'{name} counts the other way', moved(flipped)
         for degrees in (90, -90, 180):
-            zero = np.zeros(count)
-            zero[k] = np.radians(degrees)
-            yield (
-                f'zero off by {abs(degrees)}',
-                f'{names[k]} has its zero {abs(degrees)}',
-                with_(joints(lambda q, zero=zero: q + zero)),
-            )
-        for j in range(max(0, k - 1), k):
+            off, zero = abs(degrees), np.radians(degrees) * unit[k]
+            yield f'zero off by {off}', f'{name} has its zero {off}', moved(unit, zero)
+        if k:
             order = np.arange(count)
-            order[[j, k]] = k, j
-            yield (
-                'joints swapped',
-                f'{names[j]} and {names[k]} are swapped',
-                with_(joints(lambda q, order=order: q[:, order])),
-            )
+            order[[k - 1, k]] = k, k - 1
+            yield 'joints swapped', f'{names[k - 1]} and {name} are swapped', moved(unit[order])
     for k in range(1, count):
         for sign in (1.0, -1.0):
-            matrix = np.eye(count)
-            matrix[k, k - 1] = sign
-            yield (
-                'joints coupled',
-                f'{names[k]} is not given against {names[k - 1]}',
-                with_(joints(lambda q, matrix=matrix: q @ matrix.T)),
-            )
+            matrix = unit + sign * np.outer(unit[k], unit[k - 1])
+            words = f'{names[k]} is not given against {names[k - 1]}'
+            yield 'joints coupled', words, moved(matrix)
     for k in range(1, count - 2):
-        signs, zero = np.ones(count), np.zeros(count)
-        signs[k], zero[k + 1] = -1.0, 0.5 * np.pi
-        yield (
-            'a sign and a zero',
-            'several mistakes',
-            with_(joints(lambda q, signs=signs, zero=zero: signs * q + zero)),
-        )
-        yield (
-            'a sign, a zero, and mm',
-            'several mistakes',
-            with_(
-                lambda e, signs=signs, zero=zero: replace(
-                    both(e, 1e3), joints=signs * e.joints + zero
-                ),
-                measured,
-            ),
-        )
+        bad = moved(unit - 2.0 * np.diag(unit[k]), 0.5 * np.pi * unit[k + 1])
+        yield 'a sign and a zero', 'several mistakes', bad
+        in_mm = changed(bad, both(1e3)) if placed else None
+        yield 'a sign, a zero, and mm', 'several mistakes', in_mm
     for k, joint in enumerate(chain.joints):
         for kind in ('a', 'd', 'alpha'):
             arm = list(chain.joints)
