@@ -78,6 +78,13 @@ def error_of(chain, true, joints):
     return 1e3 * bench.rms(bench.distances(chain, true, joints))
 
 
+def off(result, true):
+    """Return how far (P,) parameters are from the true ones, and whether within their limits."""
+    deviation = np.array([result.chain.offset(name, true) for name in result.names])
+    width = {p.name: p.half_width() for p in result.parameters if p.std is not None}
+    return deviation, np.abs(deviation) <= [width[name] for name in result.names]
+
+
 def one_run(nominal, seed, on_flange, lens, images):
     """Return squared deviation / bound (P,), hits (P,), errors [mm] by pixels and by poses."""
     true, known, seen, other = scene(nominal, seed, on_flange, lens, images)
@@ -88,9 +95,7 @@ def one_run(nominal, seed, on_flange, lens, images):
     )
     result = identify(problem)
     bound = uncertainty.covariance(triangular_factor(true, result.names, problem.system([seen])))
-    deviation = np.array([result.chain.offset(name, true) for name in result.names])
-    width = {p.name: p.half_width() for p in result.parameters if p.std is not None}
-    hits = np.abs(deviation) <= [width[name] for name in result.names]
+    deviation, hits = off(result, true)
     poses = board_poses(seen, known.frame(frame).lens)
     by_poses = identify(Problem(known, poses, held_out=poses.select(np.arange(2))))
     errors = error_of(result.chain, true, other), error_of(by_poses.chain, true, other)
@@ -120,12 +125,9 @@ def rendered_run(nominal, seed, images):
     seen, _ = observed(detect(pictures, board)[0], board, places, True)
     known = replace(nominal, tool=Frame(lens=camera.lens))
     result = identify(Problem(known, seen, sigma_pixel=0.03))
-    deviation = [result.chain.offset(name, true) for name in result.names]
-    width = {p.name: p.half_width() for p in result.parameters if p.std is not None}
-    hits = np.abs(deviation) <= [width[name] for name in result.names]
     other = photograph(true, camera, board.corners[:1], True, 50, rng).joints
     rms = result.fitted.figures[1].rms_px
-    return hits, rms, error_of(result.chain, true, other)
+    return off(result, true)[1], rms, error_of(result.chain, true, other)
 
 
 def speed(nominal):
@@ -175,8 +177,7 @@ def main():
         hits, rms, errors = zip(*rows, strict=True)
         print(
             f'rendered: coverage {over_runs(hits, 100.0)} %, RMS '
-            f'{np.sqrt(np.mean(np.square(rms))):.4f} px, error '
-            f'{np.sqrt(np.mean(np.square(errors))):.4f} mm'
+            f'{bench.rms(rms):.4f} px, error {bench.rms(errors):.4f} mm'
         )
         return
     for name, case in CASES.items():

@@ -9,7 +9,6 @@ Needs Chromium. Opening is timed until the verdict can be read and all that is i
 Pictures show a result that is accepted (UR10, session B) and one that is refused (positioner).
 """
 
-import argparse
 import os
 import shutil
 import sys
@@ -17,8 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import bench
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
@@ -130,15 +128,12 @@ def save(part, path: Path) -> None:
 
 def main() -> None:
     """Print the table, or write the pictures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--screenshots', type=Path, metavar='FOLDER', help='write pictures there')
-    options = parser.parse_args()
-    if options.screenshots is None:
+    place = {'type': Path, 'metavar': 'FOLDER'}
+    folder = bench.options(__doc__, screenshots=(place, 'write pictures there')).screenshots
+    if folder is None:
         sizes()
-    elif not os.environ.get('CALIB_ROS_DATA'):
-        parser.error('set CALIB_ROS_DATA to the folder of the measured robots')
-    else:
-        screenshots(options.screenshots.resolve(), Path(os.environ['CALIB_ROS_DATA']))
+    elif bench.measured(RESULTS):
+        screenshots(folder.resolve(), bench.DATA.resolve())
 
 
 if __name__ == '__main__':
