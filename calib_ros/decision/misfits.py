@@ -14,6 +14,7 @@ from scipy import special
 
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.configurations import STILL
+from calib_ros.estimation.considered import travels
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import gain_share
 from calib_ros.estimation.gross_errors import SUSPICIOUS
@@ -106,13 +107,18 @@ def loose_target(sets: Sequence[Observations]) -> str:
 
 
 def coupling_share(fitted: Fitted) -> float:
-    """Return the share of the residuals that couplings of the wrist explain, if most of it."""
+    """Return the share of the residuals that couplings of the wrist explain, if most of it.
+
+    Beside scales of travel, which linear joints rather have.
+    """
     problem, chain = fitted.problem, fitted.chain
     known = [name for name, _ in chain.effects]
+    scaled = [name for name in travels(chain) if name not in known]
     added = tuple(n for n in effects.members(problem.chain, 'coupling') if n not in known)
     if not added or fitted.noise.position < SUSPICIOUS:  # nothing is left to explain
         return 0.0
-    share = explained_share(problem, chain.with_effects([*known, *added]), fitted.names, added)
+    chain = chain.with_effects([*known, *scaled, *added])
+    share = explained_share(problem, chain, [*fitted.names, *scaled], added)
     return share if share >= EXPLAINED else 0.0
 
 

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.estimation.considered import travels
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.levels import ALIKE, SEVERAL, SURE, chance_of
@@ -80,9 +81,9 @@ def _corrections(
 def _errors(fitted: Fitted, wires: Sequence[str], tried: Sequence[tuple[int, ...]]) -> FloatArray:
     """Return the sizes (K, 8) of errors of the devices that explain a misfit best, or zeros.
 
-    `tried` are numbers of `_terms`. Nor must a usual sag of the arm explain as much, or another
-    place of frames that are held. What the distances have to spare beyond places and terms counts:
-    the rest of the measurements tells nothing of their noise.
+    `tried` are numbers of `_terms`. Nor must a usual sag of the arm explain as much, or usual
+    scales of travel, or another place of frames that are held. What the distances have to spare
+    beyond places and terms counts: the rest of the measurements tells nothing of their noise.
     """
     rows, count, sags = _rows(fitted, wires)
     equations = len(rows[0])
@@ -112,7 +113,7 @@ def _left(factor: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, float
 
 
 def _rows(fitted: Fitted, wires: Sequence[str]) -> tuple[list[FloatArray], int, int]:
-    """Return rows of the fit, of sags of the arm, of terms of devices, and of residuals.
+    """Return rows of the fit, of sags and travels, of terms of devices, and of residuals.
 
     Measured ones and known ones; then the numbers of columns of the fit and of sags.
     """
@@ -121,7 +122,8 @@ def _rows(fitted: Fitted, wires: Sequence[str]) -> tuple[list[FloatArray], int, 
     ends = [end for each in sets if each.base in wires for end in (each.base, each.tool)]
     placed = [name for end in ends for name in parameters_of(end)[:3]]
     names = list(dict.fromkeys([*fitted.names, *placed]))
-    sags = [n for n in effects.members(problem.chain, 'gravity') if n not in names]
+    may_be = *effects.members(problem.chain, 'gravity'), *travels(problem.chain)
+    sags = [n for n in may_be if n not in names]
     sane = {n: problem.common_sense(n) for n in names if not problem.model.owns_frame(n)}
     usual = replace(problem, learned=Learned(sane), effects=(*problem.effects, *sags))
     system, chain = usual.system(sets), fitted.chain

@@ -10,11 +10,11 @@ import pytest
 from fits import UR10E, measured_arm
 from in_sockets import cell
 
-from calib_ros import Problem, identify
+from calib_ros import Chain, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.wires import wrong_distances
 from calib_ros.estimation.fitting import fit
-from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain import Frame, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import norms
 
@@ -66,6 +66,25 @@ def test_a_sag_that_looks_like_the_zero_of_a_draw_wire_is_not_taken_for_it(seed)
     seen = measure(true, tx90.random_joints(60, rng), rng, 3e-5, oriented=False)
     lengths = np.linalg.norm(seen.positions, axis=1)
     assert not told(fit(Problem(tx90, replace(seen, distances=lengths))))
+
+
+@pytest.mark.parametrize(('seed', 'zero'), [(0, 0.0), (1, 0.0), (0, 0.02)])
+def test_travels_out_of_scale_are_not_taken_for_a_bad_cable_or_for_couplings(seed, zero):
+    right = np.pi / 2
+    rows = ((-right, -right), (right, right), (0.0, 0.0))
+    axes = [
+        Joint(f'j{k}', alpha=alpha, theta=theta, type='prismatic', lower=0.0, upper=3.0 - k)
+        for k, (alpha, theta) in enumerate(rows)
+    ]
+    gantry, rng = Chain('gantry', 'standard', tuple(axes)), np.random.default_rng(seed)
+    travels = dict.fromkeys(['j0.ratio', 'j1.ratio', 'j2.ratio'], 3e-4) | {'j1.ratio': -2e-4}
+    true = faulty(gantry, Cell(), rng).with_effect_values(travels)
+    seen = measure(true, gantry.random_joints(200, rng), rng, 3e-5, oriented=False)
+    lengths = np.linalg.norm(seen.positions, axis=1) + zero
+    problem = Problem(gantry, replace(seen, distances=lengths), sigma_position=5e-5)
+    said = ' '.join(map(str, told(fit(problem))))
+    assert ('mm too long, by the zero' in said) if zero else not said
+    assert not identify(problem).coupled
 
 
 def test_the_zeros_of_several_draw_wires_are_named_together():
