@@ -35,7 +35,7 @@ def owners(changed):
     return [{each.owner for each in reasons} for reasons in changed]
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', range(2))
 def test_new_zeros_of_all_joints_are_one_change(earlier, seed):
     """Mastered again: with at most three changes, one by one, two of three were refused."""
     true, previous, oriented = earlier

@@ -39,8 +39,9 @@ def test_a_part_in_mm_is_named_between_new_frames_too(earlier, without_noise):
         recalibrate(earlier[without_noise], few, 0.1, new=('base',))
 
 
-@pytest.mark.parametrize('new', [(), ('base', 'tool')])
-@pytest.mark.parametrize('without_noise', [False, True])
+@pytest.mark.parametrize(
+    ('without_noise', 'new'), [(False, ('base', 'tool')), (True, ()), (True, ('base', 'tool'))]
+)
 def test_two_positions_in_mm_update_nothing(earlier, without_noise, new, unsearched):
     """Between new frames the arm was moved by kilometres, or a traceback came."""
     few = seen(10, in_mm=2)

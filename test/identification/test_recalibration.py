@@ -56,14 +56,13 @@ def test_distances_show_a_slipped_zero_of_a_wobbling_arm(earlier):
     assert {each.owner for reasons in found.changed for each in reasons} == {'elbow_joint'}
 
 
-@pytest.mark.parametrize(('seed', 'count', 'away'), [(10, 8, 0.0), (11, 10, 3e-3)])
-def test_poses_of_another_robot_are_told(seed, count, away):
+def test_poses_of_another_robot_are_told():
     """Three links that seemed bent explained them: the calibration became that of the other."""
     true = arm(0, errors=0.2)
     previous = Calibration.of(identify(problem(true, 60, 0)))
-    base = replace(true.base, matrix=true.base.matrix + away * np.eye(4, k=3))
-    other = replace(arm(seed, errors=0.2), base=base, tool=true.tool)
-    found = recalibrate(previous, problem(other, count, 1), 0.1)
+    base = replace(true.base, matrix=true.base.matrix + 3e-3 * np.eye(4, k=3))
+    other = replace(arm(11, errors=0.2), base=base, tool=true.tool)
+    found = recalibrate(previous, problem(other, 10, 1), 0.1)
     assert replace(found, another=False).accepted
     assert not found.accepted
     assert found.refusal()[0].startswith('another robot')
@@ -122,27 +121,25 @@ def test_errors_that_the_model_lacks_do_not_spoil_an_update(seed):
     assert done.calibration.chain.effects == first.chain.effects
 
 
-@pytest.mark.parametrize('stated', [True, False])
-def test_new_poses_have_the_noise_of_the_earlier_ones(stated):
+@pytest.mark.parametrize(('stated', 'seed'), [(True, 0), (False, 1)])
+def test_new_poses_have_the_noise_of_the_earlier_ones(stated, seed):
     """Of a device that is five times as noisy as assumed by default, stated once or never."""
-    noise = (5e-4, 1e-3)
+    noise, rng = (5e-4, 1e-3), np.random.default_rng(seed)
     then = dict(zip(SIGMAS, noise, strict=True)) if stated else {}
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        slipped = true.with_offsets({'elbow_joint.theta': 4e-3})
-        first, still, now = (
-            measure(arm, UR10E.random_joints(count, rng), rng, *noise)
-            for arm, count in ((true, 60), (true, 8), (slipped, 8))
-        )
-        text = Calibration.of(identify(Problem(UR10E, first, **then))).dump()
-        previous = parse_calibration(text, 'c.yaml', UR10E)
-        found = recalibrate(previous, Problem(UR10E, still), 0.1)
-        assert found.accepted
-        assert not found.changed
-        found = recalibrate(previous, Problem(UR10E, now), 0.1)
-        assert found.accepted
-        assert {each.owner for reasons in found.changed for each in reasons} == {'elbow_joint'}
+    true = faulty(UR10E, Cell(), rng)
+    slipped = true.with_offsets({'elbow_joint.theta': 4e-3})
+    first, still, now = (
+        measure(arm, UR10E.random_joints(count, rng), rng, *noise)
+        for arm, count in ((true, 60), (true, 8), (slipped, 8))
+    )
+    text = Calibration.of(identify(Problem(UR10E, first, **then))).dump()
+    previous = parse_calibration(text, 'c.yaml', UR10E)
+    found = recalibrate(previous, Problem(UR10E, still), 0.1)
+    assert found.accepted
+    assert not found.changed
+    found = recalibrate(previous, Problem(UR10E, now), 0.1)
+    assert found.accepted
+    assert {each.owner for reasons in found.changed for each in reasons} == {'elbow_joint'}
 
 
 def test_a_device_that_stands_elsewhere_and_a_new_target_are_no_change_of_the_arm(earlier):
@@ -164,8 +161,7 @@ def test_a_device_that_stands_elsewhere_and_a_new_target_are_no_change_of_the_ar
     assert {each.owner for reasons in found.changed for each in reasons} == {'base'}
 
 
-@pytest.mark.parametrize('ppm', [300.0, -500.0])
-@pytest.mark.parametrize('told', [False, True])
+@pytest.mark.parametrize(('ppm', 'told'), [(300.0, False), (-500.0, True)])
 def test_another_scale_of_the_device_is_no_change_of_the_arm(earlier, ppm, told):
     """Lengths of the arm that grow with the way to it are those of the device."""
     true, previous = earlier
@@ -183,10 +179,9 @@ def test_another_scale_of_the_device_is_no_change_of_the_arm(earlier, ppm, told)
     assert recalibrate(previous, seen, 0.1, new=new).accepted
 
 
-@pytest.mark.parametrize('slip', [0.0, 2e-3])
-def test_one_gross_error_among_few_poses_is_named(earlier, slip):
+def test_one_gross_error_among_few_poses_is_named_beside_a_slipped_zero(earlier):
     true, previous = earlier
-    now = true.with_offsets({'elbow_joint.theta': slip})
+    now = true.with_offsets({'elbow_joint.theta': 2e-3})
     seen = problem(now, 9, 2)
     positions = seen.observations.positions.copy()
     positions[3] += [0.02, -0.01, 0.03]
@@ -197,7 +192,7 @@ def test_one_gross_error_among_few_poses_is_named(earlier, slip):
     assert not recalibrate(previous, seen, 0.1).odd
 
 
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 def test_one_pose_shows_no_change(earlier, seed):
     """It may be a typing error, or a joint that has slipped: no other pose tells."""
     true, previous = earlier
@@ -285,16 +280,16 @@ HALF = 'in lines 8 to 15 alone, the positions are in mm'
 
 
 @pytest.mark.parametrize(
-    ('seed', 'change', 'said'),
+    ('change', 'said'),
     [
-        (1, lambda s: {'positions': 1e3 * s.positions}, 'in mm, not metres: --length mm'),
-        (1, lambda s: {'joints': s.joints[:, [0, 2, 1, 3, 4, 5]]}, 'elbow_joint are swapped'),
-        *((k, lambda s: {'positions': IN_MM * s.positions}, HALF) for k in (1, 2, 3)),
+        (lambda s: {'positions': 1e3 * s.positions}, 'in mm, not metres: --length mm'),
+        (lambda s: {'joints': s.joints[:, [0, 2, 1, 3, 4, 5]]}, 'elbow_joint are swapped'),
+        (lambda s: {'positions': IN_MM * s.positions}, HALF),
     ],
 )
-def test_mistakes_in_new_poses_are_named(earlier, seed, change, said):
+def test_mistakes_in_new_poses_are_named(earlier, change, said):
     true, previous = earlier
-    seen = problem(true, 15, seed)
+    seen = problem(true, 15, 1)
     with pytest.raises(InputError, match=said):
         recalibrate(previous, but(seen, **change(seen.observations)), 0.1)
 

@@ -109,7 +109,7 @@ def test_no_accuracy_is_expected_of_positions_in_millimetres():
     assert 'expected' not in made.status()
 
 
-@pytest.mark.parametrize('count', [6, 9, 10, 11, 12])
+@pytest.mark.parametrize('count', [6, 12])
 def test_positions_in_millimetres_are_told_however_few_they_are(count):
     """ "2717202 mm expected": they were explained by lengths of which no arm is."""
     made = session([replace(each, position=1e3 * each.position) for each in samples(count)])
