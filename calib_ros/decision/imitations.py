@@ -45,6 +45,7 @@ class Imitation:
         chain, known = fitted.chain, fitted.problem.given
         self._groups = [None if n in known else size_group(chain, n) for n in names]
         self._given = np.array([known.get(name, np.inf) for name in names]) ** -2.0
+        self._names = np.array(names)
         self._frames = np.array([chain.owns_frame(name) for name in names])
         self._offsets = np.append(fitted.offsets, np.zeros(len(names) - len(fitted.names)))
         self._variance = max(fitted.size, ROUNDING) ** 2
@@ -80,8 +81,17 @@ class Imitation:
         moved = Evidence(matrix, np.append(self._vector, vector), given, groups, TYPICAL)
         odds, mean, _ = moved.odds_against(still, still.most_probable(set())[0], set())
         found, size = np.split(mean, [len(self._offsets)])
-        off, far = (self._distance(each) for each in (self._offsets - found, found))
-        return (odds if off > NEARER * far else -np.inf), size
+        return (odds if self.far_from(found) else -np.inf), size
+
+    def far_from(self, true: FloatArray) -> bool:
+        """Tell whether the fit is hardly nearer than nominal to an arm of such offsets (P,)."""
+        off, far = (self._distance(each) for each in (self._offsets - true, true))
+        return off > NEARER * far
+
+    def drifts_far(self, name: str, size: float) -> bool:
+        """Tell whether a zero that drifts so far from that fitted, or back, leaves it so."""
+        drift = size * (self._names == name)
+        return self.far_from(self._offsets + drift) or self.far_from(self._offsets - drift)
 
     def _distance(self, offsets: FloatArray) -> float:
         """Return the RMS effect of offsets (P,), in the best frames, but for a factor."""

@@ -53,6 +53,8 @@ class Step:
     """Whether a frame that the chain file holds is wrong from the first pose on."""
     slow: bool = False
     """Whether it crept over the whole session."""
+    spoils: bool = False
+    """Whether the correction therefore hardly helps where it began, or where it ended."""
     longer: Mapping[str, float] = field(default_factory=dict)
     """By how much [m] the distances of devices are longer from there on, if their zeros moved."""
     later: tuple[Step, ...] = ()
@@ -66,7 +68,7 @@ class Step:
     @property
     def harmful(self) -> bool:
         """Tell whether the step spoils the fit: it mixes two arms, or describes a past one."""
-        return not self.slow and (self.kind not in IN_THE_CELL or not self.unused)
+        return self.spoils if self.slow else self.kind not in IN_THE_CELL or not self.unused
 
     def __str__(self) -> str:
         return str(self.reason)
@@ -110,7 +112,8 @@ class Step:
         again = ', measure again after ~/clear'
         what = f'the zero of {self.what}' if self.kind in ZEROS else self.what
         if self.slow:
-            return f'{what} seems to move slowly, {self._size} in all: mix the order of poses'
+            advice = f'see why{again}' if self.spoils else 'mix the order of poses'
+            return f'{what} seems to move slowly, {self._size} in all: {advice}'
         if self.kind in OF_THE_ARM:
             return f'{OF_THE_ARM[self.kind]} changed before pose {number}{again}'
         moved = f'moved {self._size} before pose {number}' + ' and later again' * bool(self.later)

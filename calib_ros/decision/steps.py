@@ -69,8 +69,9 @@ def find_step(fitted: Fitted) -> Step | None:
         if found.stops[0] and _drifts(scan, found):
             if found.group.kind in OF_THE_ARM or fitted.problem.sets[found.group.sets[0]].socket:
                 return None
-            twice = tuple(2.0 * size for size in found.sizes)  # the halves' means differ
-            found = replace(found, sizes=twice, slow=True)
+            (half, *_), (zero, *_) = found.sizes, found.group.names  # the halves' means differ
+            spoils = found.group.kind == 'joint' and _arm(scan, fitted).drifts_far(zero, half[0])
+            found = replace(found, sizes=(2.0 * half,), slow=True, spoils=spoils)
         return _described(scan, found, quiet)
     found = _imitated(scan, fitted)
     torn = found is not None and found.group.kind in IN_THE_CELL and scan.torn
@@ -111,6 +112,7 @@ class _Found:
     variance: float
     criterion: float = 0.0
     slow: bool = False
+    spoils: bool = False
 
 
 def _best(scan: Scan) -> _Found | None:
@@ -259,7 +261,7 @@ def _imitated(scan: Scan, fitted: Fitted) -> _Found | None:
     some = scan.coarse.places
     if not len(some) or all(map(scan.chain.owns_frame, fitted.names)):
         return None
-    arm = Imitation(fitted, scan.names[: scan.fitted], scan.products)
+    arm = _arm(scan, fitted)
     highest, found = LEAST, None
     known = {*fitted.problem.given} | {*scan.added} - {*fitted.problem.free}
     groups = [g for g in scan.groups if g.kind in IN_THE_CELL and not g.held]
@@ -282,6 +284,10 @@ def _imitated(scan: Scan, fitted: Fitted) -> _Found | None:
             highest = odds - trials + HALF_THE_DIGITS * abs(odds)
             found = _Found(group, (int(first) + k,), (size,), 1.0, 0.0)
     return found
+
+
+def _arm(scan: Scan, fitted: Fitted) -> Imitation:
+    return Imitation(fitted, scan.names[: scan.fitted], scan.products)
 
 
 def _drifts(scan: Scan, found: _Found) -> bool:
@@ -379,6 +385,7 @@ def _step_of(scan: Scan, found: _Found, number: int) -> Step | None:
         apart=abs(size) <= most and _separable(joints, later),
         held=bool(held),
         slow=found.slow,
+        spoils=found.spoils,
         longer=longer,
     )
 

@@ -66,6 +66,13 @@ ZERO = replace(FRAME, owners=('wire',), kind='zero', thing='the device', longer=
             'poses',
         ),
         (
+            replace(JOINT, slow=True, spoils=True),
+            'the zero of elbow_joint seems to have moved slowly, by 1.2 mrad over the session; '
+            'the correction is now off by half of that: see why, and measure again; if the poses '
+            'follow an order, errors of the arm may look so: mix them',
+            f'the zero of elbow_joint seems to move slowly, by 1.2 mrad in all: see why{AGAIN}',
+        ),
+        (
             LOAD,
             'the load of the arm changed before row 5: poses differ by 1.2 mm; measure with one '
             'load, or fit only the poses before or only those after',

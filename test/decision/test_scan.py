@@ -119,9 +119,9 @@ def test_a_target_that_creeps_is_told():
     assert any(each.startswith(told) for each in result.remarks)
 
 
-@pytest.mark.parametrize('joint', [1, 2, 4])
-def test_a_zero_that_creeps_is_told(joint):
-    """The arm was 2 mm off at the end of a session, and nobody was told."""
+@pytest.mark.parametrize(('joint', 'refused'), [(1, True), (2, True), (4, False)])
+def test_a_zero_that_creeps_is_told_and_refused_if_it_moves_the_tool_much(joint, refused):
+    """The arm was 2 mm off at the end of an accepted session, worse than nominal."""
     rng = np.random.default_rng(joint)
     true, q, name = arm(rng), UR10E.random_joints(60, rng), UR10E.joint_names[joint]
     crept = 5e-3 * np.linspace(0.0, 1.0, 60)[:, np.newaxis] * np.eye(6)[joint]
@@ -129,7 +129,8 @@ def test_a_zero_that_creeps_is_told(joint):
     result = identify(Problem(UR10E, replace(seen, joints=q), **SIGMAS))
     told = f'the zero of {name} seems to have moved slowly, by '
     assert abs(result.step.size) == pytest.approx(5e-3, rel=0.1)
-    assert any(each.startswith(told) for each in result.remarks)
+    assert [each.startswith(told) for each in result.refusals] == [True] * refused
+    assert any(each.startswith(told) for each in result.remarks) != refused
 
 
 def test_a_drift_is_compared_with_priors_as_they_are_known(monkeypatch):
