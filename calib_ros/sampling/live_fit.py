@@ -87,7 +87,7 @@ def _priors(problem: Problem, names: Sequence[str]) -> Prior:
     wide: dict[str, float] = {
         name: 1.0 if name.kind == DELAY else WIDE[name.kind in DH_ANGLES]
         for name in map(Parameter, names)
-        if not problem.model.owns_frame(name)
+        if name.kind == DELAY or not problem.model.owns_frame(name)
     }
     return Prior(problem.model, {**wide, **problem.prior_sigmas})
 

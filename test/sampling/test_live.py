@@ -239,3 +239,14 @@ def test_joints_that_hardly_moved_are_named():
     joints = np.array([[0.0, 0.0, 0.0, 0.0], [1.0, 0.3, 0.02, 0.0], [-1.0, 0.1, 0.1, 0.0]])
     assert barely_moved(chain, joints) == ('b',)
     assert barely_moved(chain, joints[:1]) == ('a', 'b', 'c')
+
+
+def test_a_delay_that_only_gross_errors_would_tell_leaves_a_status(rng):
+    """Without a prior of its own it was infinite, and the status an error."""
+    rest, true = np.zeros(6), faulty(UR10E, Cell(), rng)
+    given = enumerate(seen(true, 30, rng))
+    moved = [replace(s, velocity=rest + (k < 3), position=s.position + (k < 3)) for k, s in given]
+    made = session(mode='continuous')
+    made.restore([replace(each, acceleration=rest) for each in moved])
+    assert 'mm expected' in made.status()
+    assert 2e-5 < made.estimate.sigma < 1e-4
