@@ -144,8 +144,9 @@ def test_a_board_by_which_hardly_an_arm_grows_is_not_said_to_be_of_another_size(
     assert 'at sigma_scale 0.01 %: measure poses all' in out_of_scale(1.1e-3, stated=1e-4)
 
 
-@pytest.mark.parametrize('on_flange', [True, False])
-@pytest.mark.parametrize('size', [0.97, 1.004, 1.03])
+@pytest.mark.parametrize(
+    ('on_flange', 'size'), [(True, 0.97), (False, 1.004), (True, 1.004), (False, 1.03)]
+)
 def test_the_size_of_a_board_is_named_where_it_leaves_no_region(on_flange, size):
     """More poses, which were asked for, do not make a board known."""
     seen = images(on_flange)

@@ -71,11 +71,11 @@ def test_an_arm_with_errors_is_accepted_though_the_tracker_drifts():
     So does an arm whose lengths err alike by chance: the device may have a scale.
     """
     accepted = 0
-    for seed, kind in product(range(3), DRIFTS):
+    for seed, kind in product(range(2), DRIFTS):
         accepted += identify(Problem(UR10E, session(seed, 1.0, kind), **SIGMAS)).accepted
         shuffled = session(seed, 0.3, kind, width=None, shuffled=True)
         accepted += identify(Problem(UR10E, shuffled, **SIGMAS)).accepted
-    assert accepted >= 21
+    assert accepted >= 14
 
 
 def test_the_chance_is_uniform_where_there_is_nothing_to_gain():

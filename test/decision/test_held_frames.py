@@ -83,8 +83,7 @@ def test_a_held_base_of_the_last_session_did_not_move_within_it():
     assert 'left held by the chain file is off by' in str(step)
 
 
-@pytest.mark.parametrize('kind', ['base', 'tool'])
-@pytest.mark.parametrize('count', [1, 3])
+@pytest.mark.parametrize(('kind', 'count'), [('base', 3), ('tool', 1)])
 def test_frames_by_name_held_centimetres_off_are_all_named(kind, count):
     """Another robot was named, which fits no better."""
     rng = np.random.default_rng(0)

@@ -363,7 +363,7 @@ def test_columns_and_maps_are_within_a_telephone(chromium, result):
     seen.end()
 
 
-def test_many_refused_poses_on_a_telephone(chromium, tmp_path, monkeypatch):
+def test_many_refused_poses_on_a_telephone(unsearched, chromium, tmp_path, monkeypatch):
     """They are shown as cells and bands; a long option among the steps is broken."""
     monkeypatch.setattr(explorer, 'SINGLE', 30)
     rows = measured(chain=load_chain('ur5e'), count=40)
