@@ -217,7 +217,7 @@ def test_poses_outside_the_region_are_told(arm):
         assert ('is the calibration that of this robot?' in text) is (share != '100')
 
 
-def test_units_are_named_though_a_common_motion_would_take_most_of_the_error(arm):
+def test_units_are_named_though_a_common_motion_would_take_most_of_the_error(arm, single):
     far = with_errors(arm, 30.0 + np.random.default_rng(0).normal(scale=0.1, size=(9, 3)))
     text = in_words(found := verify(arm, [far], 1e-3))
     assert found.common < 0.1
