@@ -10,16 +10,18 @@ of the arm follow it.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib_ros.decision.scale import percent
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.considered import CONSIDERED, considered, held_frames, travels
-from calib_ros.estimation.distortion import differing, strains
+from calib_ros.estimation.distortion import STRAINS, differing, strains
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import gain_of, gain_share
 from calib_ros.estimation.leastsquares import minimise
-from calib_ros.estimation.levels import SURE, chance_of
+from calib_ros.estimation.levels import OUT_OF_SCALE, SURE, chance_of
 from calib_ros.estimation.system import System, stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import Parameter
@@ -35,7 +37,9 @@ def strain_of(fitted: Fitted) -> tuple[str, float]:
     """
     problem, names = fitted.problem, fitted.names
     pairs = zip(problem.sets, fitted.robust.inliers, strict=True)
-    system = problem.system([each.select(good).spread() for each, good in pairs])
+    learned = problem.learned and replace(problem.learned, noise=1.0)  # of what is not fitted
+    own_noise = replace(problem, learned=learned)
+    system = own_noise.system([each.select(good).spread() for each, good in pairs])
     strained = strains(system.sets)
     if not (travels(fitted.chain) or any(each.any() for each in strained)):
         return '', 0.0
@@ -49,9 +53,11 @@ def strain_of(fitted: Fitted) -> tuple[str, float]:
     rows = stacked(list(map(_with_strains, system.rows_of(chain, columns), strained)))
     free = [*range(len(names)), *(k for k, n in enumerate(columns) if n in travels(chain))]
     given, back = system.extra_rows(chain, columns)
-    usual = np.diag([0.0] * len(names) + [1.0 / size for size in more.values()])
+    sane = [1.0 / OUT_OF_SCALE] * len(STRAINS)  # else, beside linear joints, that of noise
+    usual = np.diag([0.0] * len(names) + [1.0 / size for size in more.values()] + sane)
     known = np.zeros((len(given) + len(usual), rows.shape[1]))
-    known[:, :count], known[: len(given), -1] = np.vstack([given, usual]), back
+    known[: len(given), :count], known[: len(given), -1] = given, back
+    known[len(given) :, :-1] = usual
     text = _in_words(np.vstack([rows, known]), count)
     free += range(count, rows.shape[1]) if text else [rows.shape[1] - 1]
     share = gain_share(rows[:, [*dict.fromkeys(free)]], len(names))

@@ -123,6 +123,16 @@ def test_a_linear_axis_out_of_scale_is_no_strain_of_the_device(size):
     assert told.startswith(TOLD) if size else told == ''
 
 
+def test_noise_larger_across_the_line_of_sight_is_no_strain_of_the_device():
+    """Linear joints alone imitate any strain, and that of the noise itself, 220 %, was told."""
+    axes = Chain('gantry', 'standard', GANTRY.joints[:3])
+    rng = np.random.default_rng(0)
+    q = axes.random_joints(60, rng)
+    seen = arm(0, chain=axes).forward(q)[:, :3, 3] + rng.normal(size=(60, 3)) * [1e-5, 5e-5, 5e-5]
+    problem = Problem(axes, Observations.from_arrays(q, seen), sigma_position=1e-4)
+    assert strain_of(fit(problem)) == ('', 0.0)
+
+
 @pytest.mark.parametrize(('seed', 'size'), [(0, 2e-3), (1, 2e-3), (2, 2e-3), (3, 0.0)])
 def test_linear_joints_do_not_hide_that_a_strained_device_may_harm(seed, size):
     """It was accepted and made the gantry worse; a pitch that is off was refused."""
