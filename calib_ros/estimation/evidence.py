@@ -46,12 +46,13 @@ class Inference:
     Offsets from the nominal chain are normal about zero. The samples have their weights in the
     fit, at which all is linear, and noise of size `noise` [sigma given]; without what the scale of
     linear joints explains, and a strain of the device if it is `strained`, that is `least`.
-    `rounding` are standard deviations of parameters that rounded joint values move too.
+    `rounding` are standard deviations of parameters that rounded joint values move too. The device
+    is considered unless `more` is None.
     """
 
     fitted: Fitted
     noise: float
-    more: Sequence[str] = ()
+    more: Sequence[str] | None = None
     rounding: Mapping[str, float] = field(default_factory=dict)
     strained: bool = False
     least: float = 0.0
@@ -123,19 +124,20 @@ class _Columns:
     """
 
     def __init__(self, given: Inference, waves: float = 0.0, strained: bool = False) -> None:
-        fitted, more = given.fitted, given.more
+        fitted = given.fitted
         problem, names, system = fitted.problem, fitted.names, fitted.system
+        seen, more = given.more is not None, given.more or ()
         own = [n for n in more if not (Parameter(n).of_dh or problem.model.owns_frame(n))]
         self.names, self.chain = (*names, *more), fitted.chain.with_effects(own)
         beside = {name: std for name, std in given.rounding.items() if name in names}
         whole, lengths, self.scale = self.chain, dict[str, float](), SCALE
-        if more:
+        if seen:
             whole, lengths, self.scale = lengths_of(self.chain, system)
         strained &= bool(lengths)
         noise = max(given.noise, HALF_THE_DIGITS)  # parameters that follow all exactly leave none
-        if more or beside or waves:
+        if seen or beside or waves:
             unmodelled = Unmodelled(waves=waves)
-            nuisances = Nuisances(beside, lengths, bool(more), unmodelled, True, strained)
+            nuisances = Nuisances(beside, lengths, seen, unmodelled, True, strained)
             self.sums = nuisance_products(whole, self.names, system, nuisances, noise)
         else:
             plain = fitted.products / noise**2

@@ -158,6 +158,16 @@ def test_linear_joints_do_not_hide_a_scale_alike_in_all_directions(seed):
     assert refusal.startswith('all lengths of the arm grow alike, by 0.2')
 
 
+@pytest.mark.parametrize(('seed', 'scale'), [(0, 1.0), (1, 1.0), (0, 1.002), (1, 0.998)])
+def test_fitted_pitches_of_linear_joints_alone_may_be_the_scale_of_the_device(seed, scale):
+    """Nothing else was left to consider, and so the device was not: 0.1 mm became 2 mm."""
+    axes, rng = Chain('gantry', 'standard', GANTRY.joints[:3]), np.random.default_rng(seed)
+    seen = measure(arm(seed, chain=axes), axes.random_joints(60, rng), rng, 3e-5, oriented=False)
+    seen = replace(seen, positions=scale * seen.positions)
+    result = identify(Problem(axes, seen, effects=('ratio',), sigma_position=5e-5))
+    assert [each.rule for each in result.refusals] == [Rule.SCALE] * (scale != 1.0)
+
+
 @pytest.mark.parametrize(
     ('fixed', 'seed', 'off'), [('*.a', 1, 0.0), ('base.*', 1, 3e-3), ('base.*', 0, 3e-2)]
 )
