@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -82,7 +83,7 @@ def _members(joints: tuple[tuple[str, bool, float], ...], group: str) -> tuple[P
     links = [(name, end) for k, name in enumerate(names) for end in names[k:] if name in revolute]
     found: dict[str, list[Parameter]] = {
         'ratio': [Parameter(name, group) for name in names],
-        'coupling': couplings(names[-3:]),
+        'coupling': couplings(names[-3:]) + _ball_screws(joints),
         'eccentricity': [wave for name in revolute for k in (1, 2) for wave in waves(name, k)],
         'gear': [wave for name, gear in geared for k in (1, 2) for wave in waves(name, k * gear)],
         'gravity': [Parameter(name, f'gravity_{end}') for name, end in links],
@@ -97,6 +98,14 @@ def _members(joints: tuple[tuple[str, bool, float], ...], group: str) -> tuple[P
 def couplings(joints: Sequence[str]) -> list[Parameter]:
     """Return the names of the couplings of joints with those before them."""
     return [Parameter(name, f'coupling_{o}') for i, name in enumerate(joints) for o in joints[:i]]
+
+
+def _ball_screws(joints: Sequence[tuple[str, bool, float]]) -> list[Parameter]:
+    """Return the couplings of a linear joint with the turning one after it: a SCARA's quill."""
+    pairs = pairwise(joints[-3:])
+    return [
+        Parameter(z, f'coupling_{o}') for (z, turns, _), (o, after, _) in pairs if after > turns
+    ]
 
 
 def coupled(chain: _Arm) -> frozenset[int]:

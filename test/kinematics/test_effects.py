@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commanded import twist
-from fits import NOISE, UR10E, measured_arm
+from fits import NOISE, SCARA, SIGMAS, UR10E, arm, measured_arm
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
+from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
@@ -157,6 +158,18 @@ def test_couplings_are_those_of_the_last_three_joints():
     found = effects.members(load_chain('kuka_iiwa14'), 'coupling')
     pairs = [('joint_6', 'joint_5'), ('joint_7', 'joint_5'), ('joint_7', 'joint_6')]
     assert found == tuple(f'{joint}.coupling_{other}' for joint, other in pairs)
+
+
+def test_the_quill_of_a_scara_is_coupled_to_the_turn_after_it():
+    """Its ball screw lifts it by 20 mm a turn: 5 mm became 3 mm by its other parameters."""
+    screw = f'{SCARA.joint_names[2]}.coupling_{SCARA.joint_names[3]}'
+    assert effects.members(SCARA, 'coupling')[-1] == screw
+    rng = np.random.default_rng(0)
+    true = arm(0, chain=SCARA).with_effect_values({screw: 0.02 / (2.0 * np.pi)})
+    seen = measure(true, SCARA.random_joints(60, rng), rng, *NOISE)
+    result = identify_model(Problem(SCARA, seen, **SIGMAS), 'auto')
+    assert result.accepted
+    assert result.chain.value(screw) == pytest.approx(0.02 / (2.0 * np.pi), rel=0.01)
 
 
 def by_hand(true, values, q, approach):
