@@ -9,7 +9,8 @@ With the wanted RMS error as limit, and the interval of `confidence.py`, it is
     UNDECIDED   the limit lies in the interval: more poses are needed
 
 Of a device with more noise than that of the calibration, the excess is no error of the arm: it
-does not hold only if the interval without it is beyond the limit.
+does not hold only if the interval without it is beyond the limit. Noise that nobody states is what
+a fit of all parameters and frames leaves: it would follow a change.
 """
 
 from __future__ import annotations
@@ -24,11 +25,15 @@ from calib_ros.apply.confidence import limits_of, moments_of
 from calib_ros.decision import mistakes
 from calib_ros.decision.comparison import Comparison, along_base, compare
 from calib_ros.decision.diagnosis import Diagnosis
+from calib_ros.decision.steps import find_step
 from calib_ros.decision.trials import largest_error
-from calib_ros.errors import MOST_ENTRIES
-from calib_ros.estimation.levels import CLEARLY, CONFIDENT
+from calib_ros.errors import MOST_ENTRIES, InputError
+from calib_ros.estimation.fitting import fit
+from calib_ros.estimation.levels import CLEARLY, CONFIDENT, TELLING
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.start import released
+from calib_ros.estimation.uncertainty import covariance
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.se3 import Index
 from calib_ros.shown import rounded
@@ -119,7 +124,7 @@ def judge(
     Each configuration counts once, however often it was measured; fitted frames have absorbed the
     errors of `lost` ones. Without a `tolerance` [m] the limit is that of the calibration. Remedies
     of a mistake are those of messages or of tables. `sigma_position` [m] is the noise of positions
-    without a covariance; None stands for that of the earlier device.
+    without a covariance; None that of the earlier device, or more if the errors show it.
     """
     found = found or along_base(compare(arm.before, arm.chain, sets), arm.chain, sets)
     moments = moments_of(found.after.position, found.before.configurations)
@@ -127,7 +132,8 @@ def judge(
     angle = 1e-3 * (found.figures[1].rms_mrad or 0.0)
     mistake = _mistake(arm, sets, rms, angle, of_messages)
     reused, limit = arm.reused(sets), tolerance or arm.limit(sets, found.figures[0].rms_mm)
-    noise = 0.0 if tolerance else _noise_beyond(arm, sets, sigma_position)
+    beyond = limit is not None and not tolerance and lower[0] > limit
+    noise = _noise_beyond(arm, sets, sigma_position) if beyond else 0.0
     least = np.sqrt(np.maximum(lower**2 - noise, 0.0))
     verdict: Verdict = 'no verdict'
     if limit is not None and not mistake:
@@ -160,12 +166,26 @@ def _noise_beyond(arm: Calibration, sets: Sequence[Observations], stated: float 
         return 0.0
     problem = Problem(arm.before, sets[0], more=sets[1:])  # the earlier device
     then = now = arm.noise.expected_in(problem).sigma_position
-    if stated is not None:
+    if stated is None:
+        now = max(now, _noise_left(arm, sets))
+    else:
         problem = replace(problem, sigma_position=stated)
         now = arm.noise.expected_in(problem, ('sigma_position',)).sigma_position
     found = np.concatenate([each.covariances((now, 1.0))[:, :3, :3] for each in sets])
     former = max(3.0 * then**2, arm.residual**2)
     return max(0.0, float(np.trace(found.mean(axis=0))) - former)
+
+
+def _noise_left(arm: Calibration, sets: Sequence[Observations]) -> float:
+    """Return the noise [m] that no change, nor one amidst the poses, explains; 0 of few poses."""
+    chain = released(arm.chain, arm.chain.frame_names)
+    try:
+        fitted = fit(problem := Problem(chain, sets[0], more=sets[1:]))
+    except InputError:
+        return 0.0
+    taken = float(np.sum(covariance(fitted.factor) * fitted.robust.fit.normal.parts[0]))
+    known = 3 * sum(map(len, sets)) - taken >= TELLING and find_step(fitted) is None
+    return known * fitted.noise.position * problem.sigma_position
 
 
 def _near(arm: Calibration, sets: Sequence[Observations]) -> tuple[str, ...]:

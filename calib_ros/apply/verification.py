@@ -46,7 +46,7 @@ def verify(
     `sets` are new measurements of poses or positions, in the frames of the calibration. Without a
     `tolerance`, the largest acceptable RMS position error [m], the verdict is whether the
     calibration holds, by `Calibration.limit`; `sigma_position` [m] is the noise of positions
-    without a covariance, None that of the earlier device. `progress` receives the share done.
+    without a covariance, None as in `judge`. `progress` receives the share done.
 
     With `new_base` the measuring devices were moved, with `new_tool` the targets replaced. Fitting
     a frame absorbs the errors of two configurations, or of one (on the flange: of one, or two).

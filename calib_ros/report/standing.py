@@ -34,6 +34,8 @@ STANDINGS: dict[str, tuple[Headline, tuple[str, ...]]] = {
         Headline('bad', 'The calibration no longer holds'),
         (
             SOMETHING_MOVED,
+            'If the device has more noise than that of the calibration, state it '
+            '(--sigma-position).',
             'Calibrate again with new poses, or update the calibration with a few (identify '
             '--previous).',
         ),
@@ -53,7 +55,10 @@ AT_THE_LIMIT = (
 )
 NOISY = (
     Headline('open', 'UNDECIDED: the device has too much noise to tell'),
-    ('Verify with a device as accurate as that of the calibration, or give a --tolerance.',),
+    (
+        'Verify with a device as accurate as that of the calibration, or give a --tolerance.',
+        'If it is as accurate, check for play in the joints and a loose target.',
+    ),
 )
 REUSED = (
     Headline('open', 'No verdict: the calibration was computed from these measurements'),

@@ -22,16 +22,17 @@ def test_a_device_with_more_noise_does_not_condemn_the_arm(cell, arm):
     """Its noise alone is beyond the limit; that of the earlier device is not."""
     noise = 5.0 * NOISE[0]
     seen = measured(cell[0], UR.random_joints(30, np.random.default_rng(3)), 1, (noise, 1e-3))
-    unsaid, found = verify(arm, [seen], None), verify(arm, [seen], None, sigma_position=noise)
-    assert unsaid.verdict == 'does not hold'
-    assert found.verdict == 'UNDECIDED'
-    assert standing(found)[0].heading == 'UNDECIDED: the device has too much noise to tell'
+    for given in ({'sigma_position': noise}, {}):  # unsaid, no change of an arm explains it
+        found = verify(arm, [seen], None, **given)
+        assert found.verdict == 'UNDECIDED'
+        assert standing(found)[0].heading == 'UNDECIDED: the device has too much noise to tell'
     assert verify(arm, [seen], 1e-4, sigma_position=noise).verdict == 'FAIL'  # whatever the cause
     rows = replace(seen, covariance=np.tile(np.diag([noise**2] * 3 + [1e-6] * 3), (30, 1, 1)))
     assert verify(arm, [rows], None).verdict == 'UNDECIDED'
     slipped = cell[0].with_offsets({'elbow_joint.theta': 1.5e-3})
     moved = measured(slipped, seen.joints, 1, (noise, 1e-3))
-    assert verify(arm, [moved], None, sigma_position=noise).verdict == 'does not hold'
+    for given in ({'sigma_position': noise}, {}):
+        assert verify(arm, [moved], None, **given).verdict == 'does not hold'
     few = measured(cell[0], seen.joints, 1)
     for sigma in (Settings.sigma_position, noise):  # where it decides nothing it is not told
         same = verify(arm, [few], None, sigma_position=sigma)
@@ -46,7 +47,7 @@ def test_a_stated_noise_may_have_the_value_of_the_default(cell, arm):
         arm.noise, position=1.0, orientation=1.0, given=dict(zip(names, NOISE, strict=True))
     )
     known = replace(arm, noise=was, residual=7e-5)
-    assert verify(known, [seen], None).verdict == 'does not hold'
+    assert verify(known, [seen], None, sigma_position=NOISE[0]).verdict == 'does not hold'
     assert verify(known, [seen], None, sigma_position=noise[0]).verdict == 'UNDECIDED'
     found = recalibrate(known, Problem(UR, seen), 0.0)
     assert 'if the device has more noise, state it (--sigma-position)' in found.refusal()[1]
@@ -63,6 +64,14 @@ def test_an_option_is_known_to_be_given_though_it_has_the_value_of_the_default()
         options = parser_of(given).parse_args([*given, *more])
         assert ('sigma_position' in options) == bool(more)
         assert settings_of(options) == Settings()
+
+
+def test_few_poses_tell_no_noise_from_a_change(cell, arm):
+    """Their fit would follow both: the step is to state it."""
+    seen = measured(cell[0], UR.random_joints(6, np.random.default_rng(3)), 1, (3e-4, 1e-3))
+    found = verify(arm, [seen], None)
+    assert found.verdict == 'does not hold'
+    assert any('--sigma-position' in each for each in standing(found)[1])
 
 
 def test_noise_that_is_stated_larger_than_all_errors_is_told(cell, arm):

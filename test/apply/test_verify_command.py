@@ -326,7 +326,8 @@ def test_a_calibration_does_not_hold_only_because_nothing_was_known_there(arm):
     """It removes 1.6 mm, and leaves 2.1: less than 1.5 times as much, but more."""
     errors = np.random.default_rng(0).normal(scale=1.3e-3, size=(40, 3))
     vague = replace(arm, region=replace(arm.region, square=1e6 * arm.region.square))
-    assert verify(vague, [with_errors(arm, errors)], None).verdict == 'does not hold'
+    found = verify(vague, [with_errors(arm, errors)], None, sigma_position=NOISE[0])
+    assert found.verdict == 'does not hold'
 
 
 def test_a_calibration_does_not_hold_where_the_nominal_arm_is_nearer(arm):
