@@ -34,8 +34,6 @@ STANDINGS: dict[str, tuple[Headline, tuple[str, ...]]] = {
         Headline('bad', 'The calibration no longer holds'),
         (
             SOMETHING_MOVED,
-            'If the device has more noise than that of the calibration, state it '
-            '(--sigma-position).',
             'Calibrate again with new poses, or update the calibration with a few (identify '
             '--previous).',
         ),
@@ -60,6 +58,7 @@ NOISY = (
         'If it is as accurate, check for play in the joints and a loose target.',
     ),
 )
+UNSAID = 'If the device has more noise than that of the calibration, state it (--sigma-position).'
 REUSED = (
     Headline('open', 'No verdict: the calibration was computed from these measurements'),
     (f'Measure new poses, {SPREAD_OUT}, and verify with those alone.',),
@@ -84,6 +83,9 @@ def standing(found: Verification) -> tuple[Headline, tuple[str, ...]]:
     if found.verdict == 'UNDECIDED' and found.needed is None and not found.outside:
         state, steps = NOISY if found.noise else AT_THE_LIMIT
         steps = (sentence(found.overstated),) if found.overstated else steps
+    few = 3 * found.comparison.figures[1].count < len(found.chain.parameter_names)
+    if few and found.verdict == 'does not hold':  # their fit leaves no noise to see
+        steps = (UNSAID, *steps)
     if not found.by_program:  # nor whether the correction reaches the arm
         state = replace(state, heading=state.heading.replace('the arm', 'the calibration'))
         steps = tuple(each for each in steps if each != ACTIVE)
