@@ -28,7 +28,7 @@ from calib_ros.estimation.levels import LEAST_ASIDE
 from calib_ros.estimation.pixels import in_view
 from calib_ros.estimation.samples import gram
 from calib_ros.estimation.system import System
-from calib_ros.estimation.weights import weights_of
+from calib_ros.estimation.weights import OUTLIER, weights_of
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray, Index
@@ -123,7 +123,12 @@ class Scan:
         bounded = 'huber' if gross and robust.loss != 'none' else robust.loss
         few = robust.system.select(self.chosen)
         seen = [in_view(self.chain, each.observations) for each in few.sets]
-        weights = (weights_of(each, bounded) for each in far)
+        weights = [weights_of(each, bounded) for each in far]
+        odd = np.concatenate(far)
+        odd = odd[odd > OUTLIER] if bounded == 'huber' else odd[:0]
+        if len(odd):  # by the few largest a step would hide that is most of them
+            usual = float(np.median(odd))
+            weights = [w * usual / np.maximum(d, usual) for w, d in zip(weights, far, strict=True)]
         few = few.weighted([w * each for w, each in zip(weights, seen, strict=True)])
         self._equations = np.array([float(samples.rows) for samples in few.sets])
         self.rows = _rows_of(few, self.chain, self.names)

@@ -38,6 +38,16 @@ def places(step):
     ]
 
 
+@pytest.mark.parametrize('seed', [0, 1])
+def test_few_gross_errors_hide_no_slip_near_the_end(seed):
+    """Ten poses after it were outliers too, and a calibration of the past arm was accepted."""
+    _, seen = slipped(seed, 2, [(50, 0.012)])
+    rows = np.random.default_rng(seed).choice(50, 4, replace=False)
+    seen.positions[rows] += [0.05, 0.0, 0.0]
+    step = find_step(fitting.fit(Problem(UR10E, seen, **SIGMAS)))
+    assert (step.what, step.sample) == (UR10E.joint_names[2], 50)
+
+
 @pytest.mark.parametrize(
     ('joint', 'slips'),
     [
