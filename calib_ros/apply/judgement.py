@@ -32,7 +32,7 @@ from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.levels import CLEARLY, CONFIDENT, TELLING
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.start import released
+from calib_ros.estimation.start import reframed
 from calib_ros.estimation.uncertainty import covariance
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.se3 import Index
@@ -178,7 +178,7 @@ def _noise_beyond(arm: Calibration, sets: Sequence[Observations], stated: float 
 
 def _noise_left(arm: Calibration, sets: Sequence[Observations]) -> float:
     """Return the noise [m] that no change, nor one amidst the poses, explains; 0 of few poses."""
-    chain = released(arm.chain, arm.chain.frame_names)
+    chain = reframed(arm.chain, arm.chain.frame_names, fixed=False)
     try:
         fitted = fit(problem := Problem(chain, sets[0], more=sets[1:]))
     except InputError:
