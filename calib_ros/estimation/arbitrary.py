@@ -13,7 +13,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
 A_POSE = Observations.from_arrays(np.zeros((1, 0)), np.zeros((1, 3)), np.eye(3)[np.newaxis])
 
@@ -73,5 +73,5 @@ def _meeting(
     place *= not again
     places[:, :3, 3] = place
     part = slice(2, 3) if each.plane else slice(3)
-    found = solve(chain, places, joints, each.base, each.tool, part, 20)
+    found = solve(chain, places, joints, each.base, each.tool, part, 20, enough=ROUNDING)
     return found.joints[found.converged], place

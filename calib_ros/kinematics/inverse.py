@@ -49,11 +49,12 @@ def solve(
     part: slice = slice(6),
     iterations: int = ROUNDS,
     lever: float = LEVER,
+    enough: float = SAME,
 ) -> Inverse:
     """Return the joint values near a start (N, n) that bring the target to poses (N, 4, 4).
 
     `part` are the components to reach, of position and rotation in world axes, six in all; a
-    radian counts as `lever` [m], if not both can be reached.
+    radian counts as `lever` [m], if not both can be reached. Errors of `enough` [m] count as none.
     """
     aim = Aim(chain, base, tool)
     positions = np.ascontiguousarray(poses[:, :3, 3].T)
@@ -79,10 +80,10 @@ def solve(
         return np.clip(q, lower, upper)
 
     begin = within(np.array(start, dtype=float).T, 0.0)
-    q = minimise_batch(linearise, begin, within, enough=SAME**2, rounds=iterations).x
+    q = minimise_batch(linearise, begin, within, enough=enough**2, rounds=iterations).x
     error, _ = aim.linearise(q, None, positions, axes, lever)
     apart, turned = (np.linalg.norm(part, axis=0) for part in (error[:3], error[3:] / lever))
-    return Inverse(q.T, apart, turned, np.linalg.norm(error[part], axis=0) <= SAME)
+    return Inverse(q.T, apart, turned, np.linalg.norm(error[part], axis=0) <= enough)
 
 
 class Aim:

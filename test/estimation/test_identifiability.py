@@ -17,7 +17,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.uncertainty import covariance
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.jacobian import ErrorModel
 
@@ -322,3 +322,13 @@ def test_a_place_touched_in_two_sets_tells_no_more_than_in_one(plane, rng):
     assert len({held for _, held in found}) == 1
     counts = [len(names) for names, _ in found]
     assert counts == [counts[0]] * 2 + [counts[0] + 3] * 2
+
+
+def test_planes_hide_the_size_of_a_head_of_two_axes():
+    """Touches met to 1e-9 m told it, and the target shrank into a point: all planes meet there."""
+    head = Chain(
+        'head', 'standard', (Joint('a', a=0.02, alpha=np.pi / 2, d=0.1), Joint('b', a=0.08))
+    )
+    sets = [Observations.touching(np.zeros((9, 2)), f'base_{k}') for k in range(4)]
+    problem = Problem(head, sets[0], more=sets[1:])
+    assert identifiable_and_held(problem.model, problem.free, problem.sets)[1] == ('a.a',)
