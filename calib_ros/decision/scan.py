@@ -100,10 +100,11 @@ class Switched:
 class Scan:
     """The linear model at a fit, with columns of everything that may have moved.
 
-    `variance` are its squares per degree of freedom.
+    `gross` errors count by Huber's weights (2), also none more than the median one (1), or not at
+    all (0). `variance` are the squares per degree of freedom.
     """
 
-    def __init__(self, fitted: Fitted, loaded: bool, gross: bool) -> None:
+    def __init__(self, fitted: Fitted, loaded: bool, gross: int) -> None:
         problem, names, robust = fitted.problem, fitted.names, fitted.robust
         self.problem, self.chain, self.gross = problem, robust.fit.chain, gross
         self.groups = groups_of(problem) + (of_the_arm(problem) if loaded else [])
@@ -124,9 +125,8 @@ class Scan:
         few = robust.system.select(self.chosen)
         seen = [in_view(self.chain, each.observations) for each in few.sets]
         weights = [weights_of(each, bounded) for each in far]
-        odd = np.concatenate(far)
-        odd = odd[odd > OUTLIER] if bounded == 'huber' else odd[:0]
-        if len(odd):  # by the few largest a step would hide that is most of them
+        every = np.concatenate(far)
+        if bounded == 'huber' and gross == 1 and (odd := every[every > OUTLIER]).size:
             usual = float(np.median(odd))
             weights = [w * usual / np.maximum(d, usual) for w, d in zip(weights, far, strict=True)]
         few = few.weighted([w * each for w, each in zip(weights, seen, strict=True)])

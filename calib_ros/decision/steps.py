@@ -76,24 +76,24 @@ def find_step(fitted: Fitted) -> Step | None:
     found = _imitated(scan, fitted)
     torn = found is not None and found.group.kind in IN_THE_CELL and scan.torn
     if found is not None and not torn and fitted.robust.outliers.any():
-        scan = Scan(fitted, loaded=bends, gross=False)  # these gross errors are no move
+        scan = Scan(fitted, loaded=bends, gross=0)  # these gross errors are no move
         found = _imitated(scan, fitted)
     step = None if found is None else _described(scan, found, quiet)
     return step if step is not None and step.harmful else None  # else nothing was imitated
 
 
-def _searched(fitted: Fitted, loaded: bool, gross: bool = True) -> tuple[Scan, _Found | None]:
+def _searched(fitted: Fitted, loaded: bool, gross: int = 2) -> tuple[Scan, _Found | None]:
     """Return the linear model, with a constant load or without, and its best steps.
 
-    Gross errors may be the step, or hide it.
+    Gross errors may be the step; the few largest may hide one that is most of them, or all.
     """
     scan = Scan(fitted, loaded, gross)
     found = _best(scan)
     few = found is None or scan.few_gross(found.group, found.stops)
     if gross and few and fitted.robust.outliers.any():
-        without = _searched(fitted, loaded, gross=False)
-        if found is not None or without[1] is not None:
-            return without
+        less = _searched(fitted, loaded, gross - 1)
+        if found is not None or less[1] is not None:
+            return less
     return scan, found
 
 
