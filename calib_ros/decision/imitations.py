@@ -89,9 +89,12 @@ class Imitation:
         return off > NEARER * far
 
     def drifts_far(self, name: str, size: float) -> bool:
-        """Tell whether a zero that drifts so far from that fitted, or back, leaves it so."""
-        drift = size * (self._names == name)
-        return self.far_from(self._offsets + drift) or self.far_from(self._offsets - drift)
+        """Tell whether a zero that drifts so far from that fitted, or back, leaves it so.
+
+        Of frames alone a nominal arm is fitted: it corrects nothing.
+        """
+        ends = (self._offsets + way * size * (self._names == name) for way in (1.0, -1.0))
+        return bool(self._offsets[~self._frames].any()) and any(map(self.far_from, ends))
 
     def _distance(self, offsets: FloatArray) -> float:
         """Return the RMS effect of offsets (P,), in the best frames, but for a factor."""

@@ -119,17 +119,24 @@ def test_a_target_that_creeps_is_told():
     assert any(each.startswith(told) for each in result.remarks)
 
 
-@pytest.mark.parametrize(('joint', 'refused'), [(1, True), (2, True), (4, False)])
-def test_a_zero_that_creeps_is_told_and_refused_if_it_moves_the_tool_much(joint, refused):
-    """The arm was 2 mm off at the end of an accepted session, worse than nominal."""
+@pytest.mark.parametrize(
+    ('joint', 'refused', 'fixed'),
+    [(1, True, ()), (2, True, ()), (4, False, ()), (1, False, ('*_joint.*',))],
+)
+def test_a_zero_that_creeps_is_told_and_refused_if_the_correction_is_spoilt(joint, refused, fixed):
+    """The arm was 2 mm off at the end of an accepted session; frames alone correct nothing."""
     rng = np.random.default_rng(joint)
-    true, q, name = arm(rng), UR10E.random_joints(60, rng), UR10E.joint_names[joint]
+    true, q, name = (
+        arm(rng, 0.0 if fixed else 1.0),
+        UR10E.random_joints(60, rng),
+        UR10E.joint_names[joint],
+    )
     crept = 5e-3 * np.linspace(0.0, 1.0, 60)[:, np.newaxis] * np.eye(6)[joint]
     seen = measure(true, q + crept, rng, *NOISE, oriented=joint != 2)
-    result = identify(Problem(UR10E, replace(seen, joints=q), **SIGMAS))
+    result = identify(Problem(UR10E, replace(seen, joints=q), fixed=fixed, **SIGMAS))
     told = f'the zero of {name} seems to have moved slowly, by '
     assert abs(result.step.size) == pytest.approx(5e-3, rel=0.1)
-    assert [each.startswith(told) for each in result.refusals] == [True] * refused
+    assert any(each.startswith(told) for each in result.refusals) == refused
     assert any(each.startswith(told) for each in result.remarks) != refused
 
 
@@ -185,7 +192,7 @@ def test_messages_of_whole_seconds_have_no_lines(of_messages):
 
 def test_sets_have_their_share_of_the_freedoms_of_the_fit():
     fitted = bumped()
-    model = scan.Scan(fitted, loaded=False, gross=True)
+    model = scan.Scan(fitted, loaded=False, gross=2)
     for group in model.groups:
         equations, freedom, _ = model.budget(group)
         assert (equations, freedom) == (6 * COUNT, pytest.approx(6 * COUNT - len(fitted.names)))
