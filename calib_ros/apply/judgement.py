@@ -9,8 +9,8 @@ With the wanted RMS error as limit, and the interval of `confidence.py`, it is
     UNDECIDED   the limit lies in the interval: more poses are needed
 
 Of a device with more noise than that of the calibration, the excess is no error of the arm: it
-does not hold only if the interval without it is beyond the limit. Noise that nobody states is what
-a fit of all parameters and frames leaves: it would follow a change.
+does not hold only if the interval without it is beyond the limit. Noise that nobody states is at
+most what a fit of all parameters, frames and effects leaves: it would follow a change.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
+from scipy import special
 
 from calib_ros.apply.confidence import limits_of, moments_of
 from calib_ros.decision import mistakes
@@ -35,11 +36,14 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import reframed
 from calib_ros.estimation.uncertainty import covariance
 from calib_ros.identification.calibration import Calibration
+from calib_ros.kinematics import effects
 from calib_ros.kinematics.se3 import Index
 from calib_ros.shown import rounded
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
 STANDS: dict[Verdict, Verdict] = {'PASS': 'holds', 'FAIL': 'does not hold'}
+WORN = ('ratio', 'coupling', 'eccentricity', 'gravity')
+"""Effects that a repair, wear or another load change."""
 DECIDING = 10 * MOST_ENTRIES  # largest number of configurations reported as deciding
 
 
@@ -179,13 +183,17 @@ def _noise_beyond(arm: Calibration, sets: Sequence[Observations], stated: float 
 def _noise_left(arm: Calibration, sets: Sequence[Observations]) -> float:
     """Return the noise [m] that no change, nor one amidst the poses, explains; 0 of few poses."""
     chain = reframed(arm.chain, arm.chain.frame_names, fixed=False)
+    worn = [name for group in WORN for name in effects.members(chain, group)]
     try:
-        fitted = fit(problem := Problem(chain, sets[0], more=sets[1:]))
-    except InputError:
+        fitted = fit(problem := Problem(chain, sets[0], more=sets[1:], effects=worn))
+    except (InputError, np.linalg.LinAlgError):
         return 0.0
     taken = float(np.sum(covariance(fitted.factor) * fitted.robust.fit.normal.parts[0]))
-    known = 3 * sum(map(len, sets)) - taken >= TELLING and find_step(fitted) is None
-    return known * fitted.noise.position * problem.sigma_position
+    free = 3.0 * sum(map(len, sets)) - taken
+    if free < TELLING or find_step(fitted) is not None:
+        return 0.0
+    likely = fitted.noise.position * np.sqrt(free / special.chdtri(free, CONFIDENT))
+    return float(likely * problem.sigma_position)
 
 
 def _near(arm: Calibration, sets: Sequence[Observations]) -> tuple[str, ...]:

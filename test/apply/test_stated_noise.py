@@ -5,6 +5,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from verified import NOISE, UR, measured
 
 from calib_ros.apply.judgement import judge
@@ -64,6 +65,21 @@ def test_an_option_is_known_to_be_given_though_it_has_the_value_of_the_default()
         options = parser_of(given).parse_args([*given, *more])
         assert ('sigma_position' in options) == bool(more)
         assert settings_of(options) == Settings()
+
+
+@pytest.mark.parametrize(
+    'changed',
+    [
+        {'elbow_joint.ratio': 1e-3},
+        {'shoulder_lift_joint.sin_1': 1e-3, 'elbow_joint.cos_2': 1e-3},
+        {'wrist_2_joint.coupling_wrist_1_joint': 3e-3},
+        {'elbow_joint.gravity_wrist_3_joint': 2e-3},
+    ],
+)
+def test_an_arm_that_changed_in_more_than_its_shape_is_no_noise_of_the_device(cell, arm, changed):
+    """Of worn drives, and of another load, the device was said to have too much noise."""
+    true, q = cell[0].with_effect_values(changed), UR.random_joints(30, np.random.default_rng(3))
+    assert verify(arm, [measured(true, q, 1)], None).verdict == 'does not hold'
 
 
 def test_few_poses_tell_no_noise_from_a_change(cell, arm):
