@@ -90,7 +90,7 @@ def _identified(
     coarse, share = rounded_joints(problem), coupling_share(fitted)
     more = considered(chain, names, problem.fixed, problem.sets)
     (strain, beside), coarsely = strain_of(fitted), rounding_errors(problem, coarse)
-    noise, least = (_size(fitted, max(share, each)) for each in (0.0, beside))
+    noise, least = _size(fitted, share), _size(fitted, beside)  # couplings are no strain
     inference = Inference(fitted, noise, more, coarsely, bool(strain), least)
     posterior, uncertainty = _inferred(inference)
     surprise, wider = held_out_excess(fitted, posterior, validation)

@@ -133,6 +133,16 @@ def test_noise_larger_across_the_line_of_sight_is_no_strain_of_the_device():
     assert strain_of(fit(problem)) == ('', 0.0)
 
 
+def test_what_a_coupled_quill_leaves_is_no_strain():
+    """Lengths were said to come out 140 % longer in one direction than in another."""
+    rng = np.random.default_rng(0)
+    true, q = arm(rng, chain=SCARA), SCARA.random_joints(40, rng)
+    true = true.with_effect_values({'quill.coupling_spindle': 1e-3})
+    result = identify(Problem(SCARA, measure(true, q, rng, *NOISE), **SIGMAS))
+    assert result.coupled
+    assert not any(each.rule is Rule.SCALE for each in result.refusals)
+
+
 @pytest.mark.parametrize(('seed', 'size'), [(0, 2e-3), (1, 2e-3), (2, 2e-3), (3, 0.0)])
 def test_linear_joints_do_not_hide_that_a_strained_device_may_harm(seed, size):
     """It was accepted and made the gantry worse; a pitch that is off was refused."""
