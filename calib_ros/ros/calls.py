@@ -25,7 +25,9 @@ class InOrder(Waitable):  # type: ignore[misc]  # see pyproject.toml
     def __init__(self, node: Node) -> None:
         super().__init__(node.default_callback_group)
         self._logger = node.get_logger()
-        self._services: list[Service] = [*filter(node.polled.has_entity, node.services)]
+        self._services: list[Service] = [*node.services]
+        for each in self._services:
+            each.callback_group = node.polled  # no executor serves it
         self._places: list[int] = []  # in the wait set
         self._waited = ExitStack()
         node.add_waitable(self)

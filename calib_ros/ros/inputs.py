@@ -12,13 +12,13 @@ from __future__ import annotations
 import importlib
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -28,6 +28,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.time_source import CLOCK_TOPIC
+from rclpy.waitable import Waitable
 
 from calib_ros.errors import ConfigError
 from calib_ros.sampling.batches import BATCH
@@ -274,36 +275,42 @@ class Inputs:
         return sorted(found)
 
 
-class Polled(CallbackGroup):  # type: ignore[misc]  # see pyproject.toml
-    """Entities that no executor serves, since they are polled."""
-
-    def can_execute(self, entity: object) -> bool:
-        """Return False, so that no executor waits for an entity."""
-        return False
-
-
 class Batched(Node):  # type: ignore[misc]  # see pyproject.toml
-    """A node with `polled` entities: services (`calls.py`), the time, and those of that group.
+    """A node that hides `polled` entities from executors; not all ask a callback group.
 
     At 1 kHz /clock alone takes an executor a third of a core: `take_time` takes it.
     """
 
     def __init__(self, *args: Any, **more: Any) -> None:
-        self.polled = Polled()
+        self.polled = ReentrantCallbackGroup()
         super().__init__(*args, **more)
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        """Return the subscriptions that an executor serves."""
+        return filter(self._served, super().subscriptions)
+
+    @property
+    def waitables(self) -> Iterator[Waitable]:
+        """Return the waitables that an executor serves."""
+        return filter(self._served, super().waitables)
+
+    @property
+    def services(self) -> Iterator[Service]:
+        """Return the services that an executor serves."""
+        return filter(self._served, super().services)
+
+    def _served(self, entity: Any) -> bool:
+        return entity.callback_group is not self.polled
 
     def create_subscription(self, kind: Any, topic: str, *args: Any, **more: Any) -> Subscription:
         """Subscribe; the time is polled."""
         own = {'callback_group': self.polled} if topic == CLOCK_TOPIC else {}
         return super().create_subscription(kind, topic, *args, **more | own)
 
-    def create_service(self, *args: Any, **more: Any) -> Service:
-        """Offer a service, to be answered by `InOrder`."""
-        return super().create_service(*args, **more | {'callback_group': self.polled})
-
     def take_time(self) -> None:
         """Take the last time on /clock; an invalid one must not end the node."""
-        for times in self.subscriptions:
+        for times in super().subscriptions:
             for _, message in _waiting(times)[-1:] if times.topic == CLOCK_TOPIC else ():
                 if message.clock.sec >= 0:
                     times.callback(message)

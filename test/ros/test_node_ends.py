@@ -16,6 +16,7 @@ from geometry_msgs.msg import PoseStamped
 from ros_cell import NODE, PATIENCE, START, STOPS, Cell, Child, direct, part, topics, values_of
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from calib_ros.files.archive import Archive
 from calib_ros.files.journal import read_journal
@@ -340,3 +341,17 @@ def test_a_closed_node_does_not_end_its_executor(tmp_path):
         cell.executor.shutdown()
         others.join()
         assert found
+
+
+def test_an_executor_that_asks_no_callback_group(tmp_path):
+    """It ended at two callbacks of one service; one created later is served by itself."""
+    experimental = pytest.importorskip('rclpy.experimental')
+    with Cell() as cell:
+        cell.executor.remove_node(cell.peer)
+        cell.executor.shutdown()
+        cell.executor = experimental.EventsExecutor(context=cell.context)
+        cell.executor.add_node(cell.peer)
+        node = cell.start(chain='ur10e', data_dir=str(tmp_path), use_sim_time=True)
+        node.create_service(Trigger, '~/later', lambda *_: Trigger.Response(message='here'))
+        assert 'no poses to fit' in cell.call('identify').message
+        assert cell.call('later').message == 'here'
