@@ -34,7 +34,8 @@ def options(words, **known):
 def tell(found, as_json):
     """Print figures by name as JSON, or as lines and tables.
 
-    A row for each name that has several, or for each of a list, by the first of them.
+    A row for each name that has several, or for each of a list, by the first of them; rows
+    without a common figure are in different tables.
     """
     if as_json:
         print(json.dumps(found, indent=1))
@@ -42,20 +43,39 @@ def tell(found, as_json):
     found = {name: by_first(each) for name, each in found.items()}
     rows = {name: each for name, each in found.items() if isinstance(each, dict)}
     for name, each in found.items():
-        if name not in rows:
-            print(f'{name:40} {cell(each)}')
-    deep = [n for n, row in rows.items() if any(isinstance(each, dict) for each in row.values())]
-    columns = dict.fromkeys(key for name in rows if name not in deep for key in rows[name])
+        lines = each if isinstance(each, list) and each else [each]
+        for line in lines if name not in rows else ():
+            print(f'{name:40} {cell(line)}')
+    inner = {n: row for n, row in rows.items() if any(map(listed, row.values()))}
+    table = {}
+    for name, row in rows.items():
+        if name not in inner:
+            if not any(row.keys() & other.keys() for other in table.values()):
+                show(table)
+                table = {}
+            table[name] = row
+    show(table)
+    for name, row in inner.items():
+        print(f'\n{name}')
+        tell(row, as_json)
+
+
+def show(rows):
+    """Print rows of figures below the names of their columns."""
+    columns = dict.fromkeys(key for row in rows.values() for key in row)
     widths = {each: max(len(each), 9) for each in columns}
     if columns:
         print(f'{"":40} ' + '  '.join(f'{each:>{width}}' for each, width in widths.items()))
     for name, row in rows.items():
-        if name not in deep:
-            cells = (f'{cell(row.get(each)):>{width}}' for each, width in widths.items())
-            print(f'{name:40} ' + '  '.join(cells))
-    for name in deep:
-        print(f'\n{name}')
-        tell(rows[name], as_json)
+        cells = (f'{cell(row.get(each)):>{width}}' for each, width in widths.items())
+        print(f'{name:40} ' + '  '.join(cells))
+
+
+def listed(value):
+    """Tell whether a value takes lines of its own."""
+    return isinstance(value, dict) or (
+        isinstance(value, list) and any(isinstance(each, (tuple, dict)) for each in value)
+    )
 
 
 def problem_of(name, session, chain_name='chain.yaml'):
@@ -102,5 +122,7 @@ def within(result, q, error):
 
 
 def cell(value):
-    """Return a figure as text."""
+    """Return a figure, or several, as text."""
+    if isinstance(value, (list, tuple)):
+        return ', '.join(map(cell, value)) or '-'
     return '-' if value is None else f'{value:.4g}' if isinstance(value, float) else str(value)

@@ -81,7 +81,7 @@ def main():
             )
             row = {'table': kind, 'rows': options.rows, 'read_table_s': ours, 'loadtxt_s': theirs}
             found.append(row | {'ratio': ours / theirs})
-    bench.tell({'tables': found}, options.json)
+    bench.tell(found if options.json else {'tables': found}, options.json)
 
 
 if __name__ == '__main__':
