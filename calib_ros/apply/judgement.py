@@ -144,6 +144,8 @@ def judge(
         verdict = compared(limit, least[0], upper[0])
         decided = numbers[(upper <= limit) | (least > limit)]
         noise *= verdict != compared(limit, lower[0], upper[0])
+        guessed = sigma_position is None and any(each.covariance is None for each in sets)
+        decided = decided[:0] if noise and guessed else decided  # its own error is not known
     if reused and verdict != 'FAIL':
         verdict = 'no verdict'
     verdict = STANDS.get(verdict, verdict) if tolerance is None else verdict
