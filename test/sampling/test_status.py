@@ -13,6 +13,7 @@ from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, 
 
 from calib_ros.apply.simulation import measure
 from calib_ros.errors import InputError
+from calib_ros.sampling.sample_hints import of_two_places
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 from calib_ros.values import MOST_NAMES
@@ -36,8 +37,9 @@ def test_the_way_of_a_stop_can_be_changed_while_it_runs():
 def test_measurements_of_two_places_are_told(spread, size, told):
     """Two devices on one topic were averaged and accepted, half their distance away."""
     given = [replace(s, spread=spread, position=size * s.position) for s in samples(15)]
-    made = session([*given[:1], *(replace(each, spread=0.0) for each in given[1:])])
+    made = session([*given[:4], *(replace(each, spread=0.0) for each in given[4:])])
     assert 'two devices' not in made.status()  # of some an accident
+    assert not of_two_places(6 * [spread], 6.0)  # of a usual share, too
     made = session(given)
     assert ('stops scatter by 20 mm: do two devices or targets' in made.status()) == told
     assert made.doubtful or not told
