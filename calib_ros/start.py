@@ -10,7 +10,7 @@ import sys
 
 def command_line() -> int:
     """Run the command line; return its exit status."""
-    gc.set_threshold(100_000)  # hundreds of modules are no garbage: searches took 6 % of the time
+    gc.set_threshold(100_000)  # the many objects of modules while they load are no garbage
     return _run('calib_ros.cli.main')
 
 

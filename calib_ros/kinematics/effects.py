@@ -6,7 +6,7 @@ Each effect adds `value * phi(q)` to the value of one joint, so its column of th
 that of the joint's motion times phi. An effect is a parameter named after its joint:
 
     joint_2.ratio               phi = q_2                                          [1]
-    joint_6.coupling_joint_5    phi = q_5                                          [1]
+    joint_6.coupling_joint_5    phi = q_5                                          [1, in SI]
     joint_2.sin_1, .cos_1       phi = sin(1 q_2), cos(1 q_2)                       [rad or m]
     joint_2.gravity_joint_4     phi = torque on joint 2 of unit weight at joint 4's end  [rad/m]
     joint_2.compliance          phi = torque on joint 2 of the given masses [N m]  [rad/(N m)]
@@ -55,7 +55,7 @@ class _Arm(Protocol):
 GROUPS = ('ratio', 'coupling', 'eccentricity', 'gear', 'gravity', 'compliance', 'backlash')
 """Groups of effects that can be fitted together. `gear` has the harmonics at the gear ratio and
 twice that; others are found from data (`identify_model`). `coupling` is that of the wrist, the
-last three joints."""
+last three joints, and of a SCARA's quill."""
 EXPECTED = dict.fromkeys(GROUPS, 1e-4) | dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4)
 """Typical size [rad or m] of an effect by group: a third of an arc minute for drives, an arc
 minute for bending (at a torque arm of a metre) and play; 0.3 mm for that of linear joints."""
