@@ -191,8 +191,10 @@ def _noise_left(arm: Calibration, sets: Sequence[Observations]) -> float:
     except (InputError, np.linalg.LinAlgError):
         return 0.0
     taken = float(np.sum(covariance(fitted.factor) * fitted.robust.fit.normal.parts[0]))
-    free = 3.0 * sum(map(len, sets)) - taken
-    if free < TELLING or find_step(fitted) is not None:
+    count, step = 3 * sum(map(len, sets)), find_step(fitted)
+    # one that the arm imitates leaves nothing, unless priors hold the arm back
+    moved = step is not None and (step.share < 1.0 or count < len(fitted.names))
+    if (free := count - taken) < TELLING or moved:
         return 0.0
     likely = fitted.noise.position * np.sqrt(free / special.chdtri(free, CONFIDENT))
     return float(likely * problem.sigma_position)
