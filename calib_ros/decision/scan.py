@@ -117,8 +117,8 @@ class Scan:
         self.fitted = len(names)
         self.added = list(dict.fromkeys(n for group in self.groups for n in group.names))
         self.names = list(dict.fromkeys([*names, *self.added]))
-        share = -(-robust.system.count // SOME)
-        self.chosen = [np.arange(0, len(each), share) for each in problem.sets]
+        stride = -(-robust.system.count // SOME)
+        self.chosen = [np.arange(0, len(each), stride) for each in problem.sets]
         far = [d[index] for d, index in zip(robust.distances, self.chosen, strict=True)]
         self.weights = [weights_of(each, robust.loss) for each in far]
         bounded = 'huber' if gross and robust.loss != 'none' else robust.loss

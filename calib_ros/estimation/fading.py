@@ -17,15 +17,15 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 
 
 def faded_near(
-    units: Stops, part: int, kernels: Sequence[tuple[float, float]], share: int
+    units: Stops, part: int, kernels: Sequence[tuple[float, float]], stride: int
 ) -> FloatArray:
     """Return J^T K J of errors fading in joint space, for (length, size) each.
 
-    By every `share`-th stop: pairs are many.
+    By every `stride`-th stop: pairs are many.
     """
     kernel = sum(size * units.kernel('near', length) for length, size in kernels)
-    own = np.diag(kernel) * (share - share**2)
-    kernel = share**2 * kernel + np.diag(own)
+    own = np.diag(kernel) * (stride - stride**2)
+    kernel = stride**2 * kernel + np.diag(own)
     rows = units.parts[part][:-1]
     return np.asarray(np.einsum('pcn,rcn->pr', rows @ kernel, rows, optimize=True))
 

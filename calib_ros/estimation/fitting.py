@@ -130,11 +130,11 @@ def _thin_problem(
     problem: Problem, simpler: SimplerFit | None
 ) -> tuple[Problem, SimplerFit | None]:
     """Thin a problem to the samples that determine the priors of a richer model."""
-    share = -(-sum(map(len, problem.sets)) // (2 * SOME))
-    if simpler is None or share < 2:
+    stride = -(-sum(map(len, problem.sets)) // (2 * SOME))
+    if simpler is None or stride < 2:
         return problem, simpler
-    few = problem.with_sets(s.select(np.arange(0, len(s), share)) for s in problem.sets)
-    return few, replace(simpler, distances=tuple(each[::share] for each in simpler.distances))
+    few = problem.with_sets(s.select(np.arange(0, len(s), stride)) for s in problem.sets)
+    return few, replace(simpler, distances=tuple(each[::stride] for each in simpler.distances))
 
 
 def _fit(

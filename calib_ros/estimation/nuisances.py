@@ -79,9 +79,9 @@ def nuisance_products(
     """
     waves = axis_parameters(chain) if nuisances.unmodelled.waves else ()
     columns = list(dict.fromkeys([*names, *nuisances.lengths, *waves]))
-    share = -(-system.count // most)
+    stride = -(-system.count // most)
     few = system.spread(most)
-    products = share * _products(chain, columns, few, nuisances)
+    products = stride * _products(chain, columns, few, nuisances)
     own, count = len(columns) + 1, len(names)
     every = np.eye(len(products))
     row = {str(name): k for k, name in enumerate(columns)}

@@ -192,8 +192,8 @@ class Observations(Shown):
 
     def some_images(self) -> Observations:
         """Return evenly spread images with all their rows, at most SOME_POSES."""
-        share = -(-(int(self.images[-1]) + 1) // SOME_POSES)
-        return self.select(self.images % share == 0)
+        stride = -(-(int(self.images[-1]) + 1) // SOME_POSES)
+        return self.select(self.images % stride == 0)
 
     def inverted(self, sigmas: tuple[float, float] | None = None) -> Observations:
         """Return the inverted poses, for a camera on the flange that sees a fixed target.

@@ -61,7 +61,7 @@ class Shared:
 def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     """Return which neighbours share errors, and the resulting noise."""
     kinds = tuple(DECAYS)
-    few, share = gathered(fit.chain, names, system, MOST_STOPS)
+    few, stride = gathered(fit.chain, names, system, MOST_STOPS)
     correlations = dict.fromkeys(kinds, 0.0)
     if len(few) < TELLING:
         return Shared(**correlations, found=(), middles={})
@@ -84,7 +84,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     }
     sizes = forms.sizes(kernels)
     alike = {part: found for part, found in alike.items() if sizes[part].any()}
-    even = few if share == 1 else gather(fit.chain, names, system, share, 1)
+    even = few if stride == 1 else gather(fit.chain, names, system, stride, 1)
     middles: dict[int, FloatArray] = {}
     by_kind: dict[str, dict[int, list[tuple[float, float]]]] = {kind: {} for kind in kinds}
     for part in alike:
@@ -94,7 +94,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
             if size:
                 by_kind[kind].setdefault(part, []).append((length, size))
     for part, own in by_kind['near'].items():
-        middles[part] += faded_near(even, part, own, share)
+        middles[part] += faded_near(even, part, own, stride)
     successive = faded_in_succession(fit.chain, names, system, by_kind['successive'])
     for part, middle in successive.items():
         middles[part] += middle

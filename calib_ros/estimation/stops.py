@@ -75,19 +75,19 @@ class Stops:
 def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> tuple[Stops, int]:
     """Return the stops of all sets, or of every k-th run of `most` / 20 if there are more; k."""
     total = sum(int(samples.observations.stops[-1]) + 1 for samples in system.sets)
-    share = max(1, -(-total // most))
-    return gather(chain, names, system, share, most // 20), share
+    stride = max(1, -(-total // most))
+    return gather(chain, names, system, stride, most // 20), stride
 
 
-def gather(chain: Chain, names: Sequence[str], system: System, share: int, run: int) -> Stops:
-    """Return the stops of all sets; of many, every `share`-th run of `run` stops."""
+def gather(chain: Chain, names: Sequence[str], system: System, stride: int, run: int) -> Stops:
+    """Return the stops of all sets; of many, every `stride`-th run of `run` stops."""
     widths = (max(samples.width for samples in system.sets), 3)
     parts: list[list[FloatArray]] = [[], []]
     counts, places, times, joints = [], [], [], []
     circular = np.array([joint.type == 'revolute' for joint in chain.joints])
     for number, samples in enumerate(system.sets):
         numbers = samples.observations.stops
-        chosen = numbers // run % share == 0
+        chosen = numbers // run % stride == 0
         if samples.weights is not None:
             chosen &= samples.weights > 0.0
         if not chosen.any():

@@ -82,8 +82,8 @@ class System(Shown):
 
     def spread(self, most: int) -> System:
         """Return every k-th sample of each set: at most `most` in all, or one of each set."""
-        share = -(-self.count // most)
-        return self.select([np.arange(0, samples.count, share) for samples in self.sets])
+        stride = -(-self.count // most)
+        return self.select([np.arange(0, samples.count, stride) for samples in self.sets])
 
     def weighted(self, weights: Sequence[FloatArray | None]) -> System:
         """Return the samples with weights (N,) for each set; None for ones."""

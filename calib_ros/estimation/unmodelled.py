@@ -63,7 +63,7 @@ def unmodelled_errors(
     chain, names = posterior.chain, posterior.names
     count, own = len(names), len(factor)
     every = tuple(dict.fromkeys((*names, *axis_parameters(chain))))
-    units, share = gathered(chain, every, system, SOME_POSES)
+    units, stride = gathered(chain, every, system, SOME_POSES)
     used = [part for part in units.parts if part.any()]
     rows = np.concatenate([np.zeros((len(every) + 1, 0, len(units))), *used], axis=1)
     part_of = np.arange(len(used)).repeat([part.shape[1] for part in used])
@@ -73,7 +73,7 @@ def unmodelled_errors(
     groups = configurations(units.joints)
     turns, tilts, waves, shown = _sizes(posterior, rows, (part_of, groups), products, random)
     rest = [k for k, name in enumerate(names) if name in posterior.priors and k >= own]
-    along = share * products.sum(axis=0)[:own, :-1]
+    along = stride * products.sum(axis=0)[:own, :-1]
     middle = along[:, rest] @ posterior.square[np.ix_(rest, rest)] @ along[:, rest].T
     followed = covariance(factor) @ along[:, count:]
     found = Unmodelled(turns, tilts, waves, names[:own], followed, shown)

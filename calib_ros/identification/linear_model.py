@@ -55,9 +55,9 @@ class LinearModel:
         problem = replace(problem, learned=Learned(posterior.priors, self._noise))
         self._problem = problem
         ends = np.cumsum([len(each) for each in problem.sets])
-        share = max(1, -(-int(ends[-1]) // COMPARED))
+        stride = max(1, -(-int(ends[-1]) // COMPARED))
         pairs = zip(problem.sets, np.split(geometric.fitted.judged, ends[:-1]), strict=True)
-        sets = [each.select(np.flatnonzero(good)[::share]) for each, good in pairs]
+        sets = [each.select(np.flatnonzero(good)[::stride]) for each, good in pairs]
         self._system = problem.system(sets)
         numbers = numbered(sets)
         self._groups = np.concatenate(numbers)
