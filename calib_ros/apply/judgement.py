@@ -27,7 +27,7 @@ from calib_ros.decision import mistakes
 from calib_ros.decision.comparison import Comparison, along_base, compare
 from calib_ros.decision.diagnosis import Diagnosis
 from calib_ros.decision.steps import find_step
-from calib_ros.decision.trials import largest_error
+from calib_ros.decision.trials import position_fault_limit
 from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.levels import CLEARLY, CONFIDENT, TELLING
@@ -210,7 +210,7 @@ def _mistake(
     arm: Calibration, sets: Sequence[Observations], error: float, angle: float, of_messages: bool
 ) -> Diagnosis | None:
     problem = Problem(arm.before, sets[0], more=sets[1:], of_messages=of_messages)
-    most = largest_error(problem)
+    most = position_fault_limit(problem)
     if error <= most and angle <= problem.largest_angle:
         return None
     found = mistakes.diagnose(problem, far=True) or mistakes.diagnose_alone(problem, arm.chain)

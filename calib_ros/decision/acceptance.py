@@ -17,8 +17,8 @@ from calib_ros.decision.improvement import gain_refusals, harm_refusals
 from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
-from calib_ros.decision.rounding import step_in_words
-from calib_ros.decision.trials import largest_error
+from calib_ros.decision.rounding import resolution_in_words
+from calib_ros.decision.trials import position_fault_limit
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.identifiability import DEGENERATE
@@ -58,7 +58,7 @@ def refusals(
     gained = tuple(gain_refusals(problem, result, validation, sized, scaled))
     before, after = validation.figures
     helps = after.rms_mm < before.rms_mm or all(each.rule is not Rule.GAIN for each in gained)
-    if after.rms_mm > max(1e3 * largest_error(problem), before.rms_mm / ALIKE):
+    if after.rms_mm > max(1e3 * position_fault_limit(problem), before.rms_mm / ALIKE):
         # of a fit that explains nothing the parameters tell nothing
         failed = [each for each in failed if each.rule is not Rule.COMMON_SENSE]
     return (*failed, *gained, *harm_refusals(validation, may_be_rounding, helps))
@@ -129,7 +129,7 @@ def oddities(
     units = {joint.name: joint.driven.unit for joint in problem.chain.joints}
     steps: dict[str, list[str]] = {}
     for name, size in coarse.items():
-        steps.setdefault(step_in_words(size, units[name]), []).append(name)
+        steps.setdefault(resolution_in_words(size, units[name]), []).append(name)
     if steps:
         each = [f'{step} ({", ".join(names)})' for step, names in steps.items()]
         found.append(f'joint values are multiples of {", ".join(each)}: record more digits')

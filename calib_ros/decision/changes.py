@@ -253,7 +253,7 @@ def likelier(
     rough = [(_explanation(information, columns, freedom, *pair),) for pair in pairs]
     found: list[tuple[Explanation, ...]] = []
     for k, pair in enumerate(pairs):
-        alone = information.marginalised(columns.spread([*rough[:k], *rough[k + 1 :]]))
+        alone = information.marginalised(columns.covariance([*rough[:k], *rough[k + 1 :]]))
         found.append((_explanation(alone, columns, freedom, *pair),))
     return found
 
@@ -346,7 +346,7 @@ class ChangeColumns:
             found.append((information.evidence(self.root(times)) - 0.5 * k**2, SPREAD**k))
         return max(found)
 
-    def spread(self, changed: Sequence[Sequence[Explanation]]) -> FloatArray:
+    def covariance(self, changed: Sequence[Sequence[Explanation]]) -> FloatArray:
         """Return the prior covariance (P, P) of changes whose sizes the data determine."""
         found = np.zeros((self._count, self._count))
         for each in (each for reasons in changed for each in reasons):

@@ -13,7 +13,7 @@ from calib_ros.decision.comparison import COUNTS, Comparison, log_gain, mean_squ
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.scale import out_of_scale
-from calib_ros.decision.trials import largest_error
+from calib_ros.decision.trials import position_fault_limit
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, CONFIDENT
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags
@@ -35,7 +35,7 @@ def gain_refusals(
     before, after = validation.figures
     judged = validation.deciding
     gain, limit = _gain(validation, 'position', judged)
-    largest = 1e3 * largest_error(problem)
+    largest = 1e3 * position_fault_limit(problem)
     tiny = largest < 1e3 * problem.largest_error
     if after.rms_mm > largest and (before.rms_mm > largest or gain > limit):
         yield Reason(

@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 
 from calib_ros.decision.suspects import rows_away
-from calib_ros.decision.trials import in_frames, largest_of, sample_errors
+from calib_ros.decision.trials import fault_limit, in_frames, sample_errors
 from calib_ros.decision.undoing import Suspect
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import LEAST_ASIDE, NEARER
@@ -124,7 +124,7 @@ def computed_rows(problem: Problem) -> str:
         some = [each for each in map(alone.select, parts) if covers(each, least)]
         trials = [in_frames(problem, arm, (each,)) for each in some]
         found = sorted(trials, key=lambda one: one.error)
-        if len(found) < 2 or found[1].error > largest_of(problem):
+        if len(found) < 2 or found[1].error > fault_limit(problem):
             continue
         if found[0].error < EXCEPTION**2 * found[1].error:
             away = sample_errors(found[0].chain, alone, flange(found[0].chain, alone))

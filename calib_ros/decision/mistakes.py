@@ -27,11 +27,11 @@ from calib_ros.decision.suspects import FIRST, ORIENTATIONS, hidden, suspects
 from calib_ros.decision.trials import (
     Trial,
     as_poses,
+    fault_limit,
     fits_each_side,
     in_frames,
-    largest_error,
-    largest_of,
     misfit_set,
+    position_fault_limit,
     refine_trial,
     sample_errors,
     set_in_words,
@@ -90,7 +90,7 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
     """
     if not result.converged or (not result.refusals and result.coupled):
         return True
-    judged, most = result.validation or result.fitted, largest_error(problem)
+    judged, most = result.validation or result.fitted, position_fault_limit(problem)
     for each in (*judged.figures_of_all, result.fitted.figures_of_all[0]):
         error, angle = 1e-3 * each.rms_mm, 1e-3 * (each.rms_mrad or 0.0)
         if error > most or angle > problem.largest_angle:
@@ -123,7 +123,7 @@ def _diagnosed(problem: Problem, sets: Sets, far: bool) -> Diagnosis | None:
     if not sets[0].socket:
         sets, where = misfit_set(problem, chain, sets)
     given = in_frames(problem, chain, sets)
-    largest = largest_of(problem)
+    largest = fault_limit(problem)
     if far and given.error <= largest:
         return None
     missing = None if _has_images(problem) else orders.constant_axes(chain, given.sets)
@@ -168,7 +168,7 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Diagnosis | 
 
     Its frames hold for them too, so few rows tell as much as many.
     """
-    far = sample_errors(chain, seen, flange(chain, seen)) > largest_of(problem)
+    far = sample_errors(chain, seen, flange(chain, seen)) > fault_limit(problem)
     rows = np.flatnonzero(far)
     if len(rows) < LEAST_ASIDE:
         return None
@@ -222,7 +222,7 @@ def _named(
     """
     most = EXCEPTION * min(given.share, 1.0) if inexact else 0.0
     # an arm in mm fits places in mm, and is off by metres
-    good = [x for x in tried if x[0].error <= largest_of(problem) or x[0].share <= most]
+    good = [x for x in tried if x[0].error <= fault_limit(problem) or x[0].share <= most]
     if not good:
         return None
     best, least = good[0][0], good[0][0].share
@@ -259,7 +259,7 @@ def _of_tables(
 
 
 def _of_repeats(problem: Problem, chain: Chain, seen: Observations) -> Diagnosis | None:
-    odd = lost_rows.repeating(chain, seen, largest_of(problem), problem.of_messages)
+    odd = lost_rows.repeating(chain, seen, fault_limit(problem), problem.of_messages)
     return None if odd is None else Diagnosis((odd,), np.nan, np.nan)
 
 
@@ -280,7 +280,7 @@ def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> D
         parts += [rows < third, rows >= 2 * third, rows % 2 == 0, rows % 2 == 1]
     some = (whole.select(part) for part in parts if part.sum() >= FEW)
     for one in (given, *(in_frames(problem, chain, (each,)) for each in some)):
-        if one.error <= largest_of(problem) and (found := _of_rows(problem, one.chain, whole)):
+        if one.error <= fault_limit(problem) and (found := _of_rows(problem, one.chain, whole)):
             return found
     return None
 
@@ -314,12 +314,12 @@ def _beam_search(problem: Problem, chain: Chain, given: Trial) -> Diagnosis | No
     or another is no better. The first may be no better alone: two mistakes can hide each other. So
     these are tried together (`hidden`).
     """
-    if given.error <= largest_error(problem):
+    if given.error <= position_fault_limit(problem):
         return None
     few = given.sets
     options = [each for each in suspects(chain, few, _has_images(problem)) if each.part]
-    largest, share = min(largest_of(problem), NEARER * given.error), NEARER * min(given.share, 1.0)
-    least = given.share
+    largest, least = min(fault_limit(problem), NEARER * given.error), given.share
+    share = NEARER * min(least, 1.0)
     kept: list[tuple[Suspect, ...]] = [()]
     for number in range(SEVERAL + 1):  # several of joints, one of the poses
         found: dict[float, tuple[Trial, tuple[Suspect, ...]]] = {}

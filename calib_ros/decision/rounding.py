@@ -25,7 +25,7 @@ from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.values import ROUNDED, SAME
 
-STEPS = (
+RESOLUTIONS = (
     *(1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4),
     *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01]).tolist(),
 )
@@ -40,11 +40,12 @@ def rounded_joints(problem: Problem) -> dict[str, float]:
     joints = np.concatenate([each.joints for each in problem.sets])
     if np.abs(joints).max() > TWO_TURNS:
         return {}
-    steps = {name: step_of(q) for name, q in zip(problem.chain.joint_names, joints.T, strict=True)}
+    pairs = zip(problem.chain.joint_names, joints.T, strict=True)
+    steps = {name: resolution_of(q) for name, q in pairs}
     return {name: step for name, step in steps.items() if step > 0.0}
 
 
-def step_in_words(step: float, unit: str) -> str:
+def resolution_in_words(step: float, unit: str) -> str:
     """Return a step of rounded values [rad or m] in the unit in which they were written."""
     degrees = round(float(np.rad2deg(step)), 3)
     written = unit == 'rad' and abs(np.deg2rad(degrees) / step - 1.0) < SAME
@@ -67,10 +68,10 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
     return found
 
 
-def step_of(values: FloatArray) -> float:
+def resolution_of(values: FloatArray) -> float:
     """Return the step [rad or m] of which values (N,) are multiples; 0 for none."""
-    few = values[:3, np.newaxis] / STEPS
-    likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < ROUNDED, STEPS).tolist()
+    few = values[:3, np.newaxis] / RESOLUTIONS
+    likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < ROUNDED, RESOLUTIONS).tolist()
     for step in sorted(likely, reverse=True):
         if _are_multiples(values, step):
             wider = _are_multiples(values, CLEARLY * step)

@@ -35,7 +35,7 @@ from calib_ros.decision.moved import (
     thing_of,
 )
 from calib_ros.decision.scan import Scan, Switched
-from calib_ros.decision.trials import largest_of
+from calib_ros.decision.trials import fault_limit
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import gain_of
 from calib_ros.estimation.gross_errors import SUSPICIOUS
@@ -176,9 +176,9 @@ def _several(scan: Scan, alone: _Found | None) -> _Found | None:
 
 def _several_of(scan: Scan, group: Moving) -> _Found | None:
     """Return several steps of a group, each of which explains most of what the others leave."""
-    switched, chosen, steps = scan.coarse, list[int](), list[_OneMore]()
+    switched, chosen, steps = scan.coarse, list[int](), list[_Candidate]()
     for _ in range(TRIED):
-        steps.append(_one_more(scan, switched, group, chosen))
+        steps.append(_beside(scan, switched, group, chosen))
         chosen.append(steps[-1].number)
     if max(each.together for each in steps) <= 0.5 * EXPLAINED:
         return None
@@ -203,7 +203,7 @@ def _several_of(scan: Scan, group: Moving) -> _Found | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _OneMore:
+class _Candidate:
     """A step beside others: the number of its place, its size, its share of what they leave.
 
     All of them explain a share `together` and leave the squares `rest`, with so many `degrees` of
@@ -220,15 +220,15 @@ class _OneMore:
 
 def _settled(
     scan: Scan, switched: Switched, group: Moving, chosen: list[int], least: float
-) -> list[_OneMore]:
+) -> list[_Candidate]:
     """Return steps, each in the best place beside the others, that explain a share of the rest.
 
     Others are left out one by one; none if only one is left.
     """
     while len(chosen) > 1:
-        steps = list[_OneMore]()
+        steps = list[_Candidate]()
         for _ in range(2 * len(chosen)):
-            steps.append(_one_more(scan, switched, group, chosen[1:]))
+            steps.append(_beside(scan, switched, group, chosen[1:]))
             chosen = [*chosen[1:], steps[-1].number]
         steps = steps[len(chosen) :]
         worst = min(range(len(steps)), key=lambda k: steps[k].share)
@@ -238,7 +238,7 @@ def _settled(
     return []
 
 
-def _one_more(scan: Scan, switched: Switched, group: Moving, beside: Sequence[int]) -> _OneMore:
+def _beside(scan: Scan, switched: Switched, group: Moving, beside: Sequence[int]) -> _Candidate:
     """Return the best step of a group beside others; one by chance or too near has no share."""
     more, places = switched.one_more(scan.columns(group), beside), switched.places
     k = int(np.argmax(np.where(places > 0, more.gains, 0.0)))
@@ -253,7 +253,7 @@ def _one_more(scan: Scan, switched: Switched, group: Moving, beside: Sequence[in
         clear = scan.stops * len(scan.groups) * chance < 1.0 - SURE
         if clear and (np.abs(places[[*beside]] - places[k]) >= LEAST_ASIDE).all():
             share = 1.0 - own * (freedom - ways) / max(left - more.before, 1e-12 * left)
-    return _OneMore(k, more.size(k), share, together, rest, degrees)
+    return _Candidate(k, more.size(k), share, together, rest, degrees)
 
 
 def _imitated(scan: Scan, fitted: Fitted) -> _Found | None:
@@ -363,7 +363,7 @@ def _step_of(scan: Scan, found: _Found, number: int) -> Step | None:
     weights = np.concatenate([scan.weights[k] for k in group.sets])
     later = np.concatenate(after)
     sides = (BEFORE_THAT, ~later), (FROM_THERE, later)
-    most = largest_of(problem) if unit == 'm' else problem.largest_angle
+    most = fault_limit(problem) if unit == 'm' else problem.largest_angle
     if found.slow and abs(size) > CLEARLY * most:
         return None  # any large errors look so where the arm moves slowly
     joints = scan.joints(group.sets)

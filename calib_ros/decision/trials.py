@@ -19,7 +19,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
 from calib_ros.estimation.samples import Samples
-from calib_ros.estimation.start import closed_forms, flange, movable
+from calib_ros.estimation.start import closed_forms, flange, free_in
 from calib_ros.estimation.system import System
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -97,7 +97,7 @@ def in_frames(problem: Problem, chain: Chain, sets: Sets) -> Trial:
     return refine_trial(problem, trial_of(chain, tuple(each.spread() for each in sets)))
 
 
-def largest_error(problem: Problem) -> float:
+def position_fault_limit(problem: Problem) -> float:
     """Return the largest error [m] of positions of a faulty arm.
 
     Of a tiny one a tenth of its longest length or of their spread, but not less than clearly
@@ -113,12 +113,12 @@ def largest_error(problem: Problem) -> float:
     return min(problem.largest_error, max(tenth, CLEARLY * problem.sigma_position))
 
 
-def largest_of(problem: Problem) -> float:
+def fault_limit(problem: Problem) -> float:
     """Return the largest error [m] of a faulty arm, with that of its orientation.
 
     Of positions alone in proportion to the arm, if it is tiny.
     """
-    most, size = problem.largest_error, largest_error(problem)
+    most, size = problem.largest_error, position_fault_limit(problem)
     whole = most + LEVER * problem.largest_angle / 3.0
     tiny = size < most and not any(each.oriented.any() for each in problem.sets)
     return whole * size / most if tiny else whole
@@ -136,7 +136,7 @@ def fits_each_side(problem: Problem, seen: Observations, stamp_ns: int) -> bool:
     if min(np.count_nonzero(before), np.count_nonzero(~before)) < 2 * IN_A_FRAME:
         return False
     sides = [in_frames(problem, arm, (alone.select(rows),)) for rows in (before, ~before)]
-    return all(side.error <= largest_of(problem) for side in sides)
+    return all(side.error <= fault_limit(problem) for side in sides)
 
 
 def misfit_set(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
@@ -146,7 +146,7 @@ def misfit_set(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
     """
     trials = [in_frames(problem, chain, (each,)) for each in sets] if len(sets) > 1 else []
     errors = np.array([trial.error for trial in trials])
-    wrong = np.flatnonzero(errors > largest_of(problem)).tolist()
+    wrong = np.flatnonzero(errors > fault_limit(problem)).tolist()
     worst = max(wrong or range(len(sets)), key=lambda k: len(sets[k]))
     if not 0 < len(wrong) < len(sets):
         return (sets[worst],), ''
@@ -177,7 +177,7 @@ def refine_trial(problem: Problem, trial: Trial) -> Trial:
     usual = [e.select(sample_errors(chain, e, arm) <= CLEARLY * trial.error) for e, arm in pairs]
     system = System(tuple(Samples(each, *sigmas) for each in usual))
     sockets = {each.base for each in sets if each.socket}
-    every = movable(chain, dict.fromkeys(name for each in sets for name in (each.base, each.tool)))
+    every = free_in(chain, dict.fromkeys(name for each in sets for name in (each.base, each.tool)))
     names = [name for name in every if name.is_length or name.owner not in sockets]
     known = excited(factor_of(chain, names, system), names)
     fitted = minimise(chain, known, system, tolerance=1e-2, iterations=12).chain

@@ -82,7 +82,7 @@ def in_new_frames(
     Raises InputError if these do not show where the frames are, if that is `needed`.
     """
     known = reframed(reframed(arm, arm.frame_names, fixed=True), new, fixed=False)
-    own = movable(known, new)
+    own = free_in(known, new)
     found = start_frames(replace(problem, chain=known))
     if needed:
         _check_shown(found, own, problem, system)
@@ -125,7 +125,7 @@ def _check_shown(
 def _start_one(
     chain: Chain, observations: Observations, sigmas: tuple[float, float], loss: str
 ) -> Chain:
-    every = movable(chain, ('base', 'tool'))
+    every = free_in(chain, ('base', 'tool'))
     whole = observations.width == 6 or observations.seen
     names = [name for name in every if whole or name.owner == 'base' or name.is_length]
     if not names:
@@ -175,7 +175,7 @@ def flange(chain: Chain, observations: Observations) -> FloatArray:
     return arm.forward(observations.joints, observations.approach)
 
 
-def movable(chain: Chain, frames: Iterable[str]) -> list[Parameter]:
+def free_in(chain: Chain, frames: Iterable[str]) -> list[Parameter]:
     """Return the parameters of the frames that are not fixed."""
     return [n for each in frames if not chain.frame(each).fixed for n in parameters_of(each)]
 

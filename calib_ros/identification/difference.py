@@ -140,9 +140,9 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     changed: list[tuple[Explanation, ...]] = []
     while len(changed) < SEVERAL and (reasons := changes.reasons_of(left_over, columns, freedom)):
         changed.append(reasons)
-        left_over = every.marginalised(columns.spread(changed))
+        left_over = every.marginalised(columns.covariance(changed))
     changed = changes.likelier(every, columns, freedom, changed)
-    left_over = every.marginalised(columns.spread(changed))
+    left_over = every.marginalised(columns.covariance(changed))
     another = is_another(every, columns, changed, first.chain, first.before)
     predicted = changes.mean_square_change(chain, names)
     rng = np.random.default_rng(0)

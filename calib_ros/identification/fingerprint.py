@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calib_ros.decision.rounding import step_of
+from calib_ros.decision.rounding import resolution_of
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.levels import CERTAIN, FEW, NEARER
 from calib_ros.estimation.observations import Observations
@@ -146,7 +146,7 @@ class Fingerprint:
         new = _of_positions(sets)
         if not (len(new) and len(self.values) and new.shape[1] == self.values.shape[1]):
             return 0.0
-        step, count = max(map(step_of, new.T[-3:])), new.shape[1]
+        step, count = max(map(resolution_of, new.T[-3:])), new.shape[1]
         reach = np.full(count, Settings.still)
         reach[-3:] = EXACT + 0.5 * np.clip(step, 10.0 * EXACT, Settings.sigma_position)
         near, same = (

@@ -270,7 +270,7 @@ class _Arm:
 
     def widened(self, columns: ChangeColumns, changed: Sequence[Sequence[Explanation]]) -> _Arm:
         """Return the arm with changes of unknown size."""
-        return replace(self, square=self.square + columns.spread(changed))
+        return replace(self, square=self.square + columns.covariance(changed))
 
     def changes(
         self, information: Information, columns: ChangeColumns

@@ -16,7 +16,7 @@ from calib_ros.errors import ConfigError
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.start import fit_to_arm, movable
+from calib_ros.estimation.start import fit_to_arm, free_in
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import (
     calibration_record,
@@ -180,7 +180,7 @@ class Record:
         joints = nominal.random_joints(SOME_POSES, np.random.default_rng(0))
         base, tool = chain.frame('base'), chain.frame('tool')
         start = replace(nominal, base=base, tool=tool, frames=chain.frames)
-        names = movable(start, ('base', 'tool'))
+        names = free_in(start, ('base', 'tool'))
         return fit_to_arm(start, names, chain, joints)[0] if names else start
 
     def covariance(

@@ -10,7 +10,7 @@ from test_steps import NOISE, SIGMAS, UR10E, arm, poses
 
 from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.decision import rounding
-from calib_ros.decision.rounding import rounded_joints, rounding_errors, step_in_words
+from calib_ros.decision.rounding import resolution_in_words, rounded_joints, rounding_errors
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.observations import numbered
@@ -154,8 +154,9 @@ def test_what_rounding_gives_to_the_zero_of_a_joint(step, rng):
 
 def test_a_step_is_told_in_the_unit_of_the_file():
     """Of joint values in degrees it was "0.175 mrad"."""
-    steps = (1e-4, 'rad'), (np.deg2rad(0.01), 'rad'), (np.deg2rad(0.2), 'rad'), (5e-4, 'm')
-    assert [step_in_words(*each) for each in steps] == ['0.1 mrad', '0.01°', '0.2°', '0.5 mm']
+    found = (1e-4, 'rad'), (np.deg2rad(0.01), 'rad'), (np.deg2rad(0.2), 'rad'), (5e-4, 'm')
+    words = [resolution_in_words(*each) for each in found]
+    assert words == ['0.1 mrad', '0.01°', '0.2°', '0.5 mm']
 
 
 def test_errors_that_rounding_gives_to_zeros_are_of_the_session(rng, monkeypatch):

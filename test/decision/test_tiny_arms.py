@@ -12,7 +12,7 @@ from calib_ros import Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.apply.verification import verify
 from calib_ros.decision.reasons import Rule
-from calib_ros.decision.trials import largest_error
+from calib_ros.decision.trials import position_fault_limit
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
@@ -66,16 +66,16 @@ def test_a_tiny_arm_is_right_to_a_tenth_of_its_size_and_beyond_the_noise():
     seen = seen_of()
     spread, longest = (seen.positions.var(axis=0).sum()) ** 0.5, 0.02 * abs(UR10E.joints[1].a)
     assert spread > longest
-    assert largest_error(Problem(TINY, seen, **SIGMAS)) == pytest.approx(0.1 * spread)
+    assert position_fault_limit(Problem(TINY, seen, **SIGMAS)) == pytest.approx(0.1 * spread)
     still = replace(seen, positions=1e-9 * seen.positions)
-    assert largest_error(Problem(TINY, still, **SIGMAS)) == pytest.approx(0.1 * longest)
-    assert largest_error(Problem(TINY, still, sigma_position=1e-3)) == pytest.approx(5e-3)
-    assert largest_error(Problem(UR10E, still, **SIGMAS)) == 0.01
+    assert position_fault_limit(Problem(TINY, still, **SIGMAS)) == pytest.approx(0.1 * longest)
+    assert position_fault_limit(Problem(TINY, still, sigma_position=1e-3)) == pytest.approx(5e-3)
+    assert position_fault_limit(Problem(UR10E, still, **SIGMAS)) == 0.01
     away = replace(seen, positions=1e3 * seen.positions)
-    assert largest_error(Problem(TINY, away, **SIGMAS)) == 0.01
+    assert position_fault_limit(Problem(TINY, away, **SIGMAS)) == 0.01
     lengths = (seen.positions**2).sum(axis=1) ** 0.5
     wire = replace(seen, positions=0.0 * seen.positions, distances=lengths)
-    assert largest_error(Problem(TINY, wire, **SIGMAS)) == 0.01
+    assert position_fault_limit(Problem(TINY, wire, **SIGMAS)) == 0.01
 
 
 def test_no_gain_of_a_tiny_arm_is_told_in_digits_that_count():
