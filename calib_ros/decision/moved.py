@@ -144,6 +144,9 @@ class Step:
         if self.unused:
             more += f'; measurements {self.unused} carry no weight'
             more += f': {self.what} {self._are} outdated, measure again' * self.outdated
+        if self.later and self.kind in FRAMES:
+            several = 'device' if self.kind == 'base' else 'target'
+            more += f'; if these are several {several}s, name each (column {several}, or sources)'
         if self.longer and not (self.slow or self.later):
             more += f'; {self._correction}'
         if self.apart:

@@ -12,27 +12,14 @@ import numpy as np
 
 from calib_ros.decision.lost_rows import EXPLAINED_ROWS, FEWEST_ROWS, MOST_SEARCHED, covers
 from calib_ros.decision.suspects import reordered
-from calib_ros.decision.trials import Trial, in_frames, sample_errors
+from calib_ros.decision.trials import in_frames
 from calib_ros.decision.undoing import Sets, Suspect
-from calib_ros.estimation.leastsquares import minimise
-from calib_ros.estimation.levels import (
-    ALIKE,
-    CLEARLY,
-    LEAST_ASIDE,
-    NEARER,
-    SEVERAL,
-    TELLING,
-    TRIED,
-)
+from calib_ros.estimation.levels import CLEARLY, NEARER, SEVERAL, TELLING, TRIED
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.samples import Samples
-from calib_ros.estimation.start import flange
-from calib_ros.estimation.system import System
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
-from calib_ros.kinematics.se3 import ROUNDING, Index
-from calib_ros.shown import rows_in_words
+from calib_ros.kinematics.se3 import ROUNDING
 
 
 def other_order(
@@ -74,10 +61,9 @@ def in_turn(
     """Return that rows are of targets, devices or arms in turn, as `row_loss`.
 
     The arm fits each alone within `most` [m]. They are told apart by their places among the rows
-    of one stop, else among all, or as three or more blocks of rows. Each visits enough
-    configurations, as far apart as those of all: frames explain few of them, or those of one
-    place, whatever is wrong. The chain file holds frames of one of them only; if those of all rows
-    would do, it holds wrong ones.
+    of one stop, else among all. Each visits enough configurations, as far apart as those of all:
+    frames explain few of them, or those of one place, whatever is wrong. The chain file holds
+    frames of one of them only; if those of all rows would do, it holds wrong ones.
     """
     arm = replace(nominal, base=None, tool=None, frames=())
     images = any(each.pixels is not None for each in problem.sets)
@@ -85,58 +71,16 @@ def in_turn(
         return None
     rows, least = np.arange(len(seen)), np.ptp(seen.joints, axis=0) / 2.0
     begins = np.flatnonzero(np.diff(seen.stops, prepend=-1))
-    for way in (rows - begins[seen.stops], *(rows % (2 + k) for k in range(SEVERAL)), None):
-        turns = _blocks(problem, arm, seen, most) if way is None else way
+    for turns in (rows - begins[seen.stops], *(rows % (2 + k) for k in range(SEVERAL))):
         parts = [seen.select(turns == k) for k in range(1 + turns.max(initial=0))]
         parts = [part for part in parts if covers(part, least, 2 * IN_A_FRAME)]
-        fewest = SEVERAL if way is None else 2  # of two, one moved
-        if len(parts) < fewest or sum(map(len, parts)) < EXPLAINED_ROWS * len(rows):
+        if len(parts) < 2 or sum(map(len, parts)) < EXPLAINED_ROWS * len(rows):
             continue
         first = in_frames(problem, arm, (parts[0],))
-        errors, how = [first.error, *_errors(problem, arm, parts[1:], most)], ' in turn'
-        if way is None and first.error <= most:
-            starts = (1 + np.flatnonzero(np.diff(turns))).tolist()
-            lines = rows_in_words(starts, seen.stamps_ns)
-            slip = _slipped(problem, first, parts, lines)
-            if slip[1] <= min(most, ALIKE * max(errors)):
-                return slip
-            how = f', others from {lines} on'
+        errors = [first.error, *_errors(problem, arm, parts[1:], most)]
         if max(errors) <= most:
-            return _named_in_turn(problem, first.chain, parts, most, how), max(errors)
+            return _named_in_turn(problem, first.chain, parts, most), max(errors)
     return None
-
-
-def _slipped(
-    problem: Problem, first: Trial, parts: Sequence[Observations], lines: str
-) -> tuple[Suspect, float]:
-    """Return the joint whose zero explains most in later parts, and the largest error [m]."""
-    arm, least = first.chain, (np.inf, '')
-    for joint in arm.joints:
-        found = []
-        for part in parts[1:]:
-            system = System((Samples(part, problem.sigma_position, problem.sigma_orientation),))
-            chain = minimise(arm, [joint.driven], system, tolerance=1e-2, iterations=12).chain
-            found.append(Trial(chain, (part,), (flange(chain, part),)).error)
-        least = min(least, (max(found), joint.name))
-    what, remedy = f'the zero of {least[1]} moved before {lines}', 'check its mastering'
-    again = f'{remedy}, and measure again (after ~/clear)'
-    remedy += '; measure again, or give only the rows between two of these'
-    return Suspect(what, remedy, published=again), least[0]
-
-
-def _blocks(problem: Problem, arm: Chain, seen: Observations, most: float) -> Index:
-    """Return numbers (N,) of blocks of rows: one ends where its frames fit no more."""
-    blocks, begin = np.zeros(len(seen), dtype=np.intp), 0
-    while begin + 2 * IN_A_FRAME <= len(seen) <= MOST_SEARCHED:
-        found = in_frames(problem, arm, (seen.select(begin + np.arange(2 * IN_A_FRAME)),)).chain
-        later = seen.select(slice(begin, None))
-        far = sample_errors(found, later, flange(found, later)) > most
-        gone = np.flatnonzero(np.lib.stride_tricks.sliding_window_view(far, LEAST_ASIDE).all(1))
-        if not len(gone) or gone[0] < LEAST_ASIDE:
-            break
-        begin += int(gone[0])
-        blocks[begin:] += 1
-    return blocks
 
 
 def _errors(
@@ -150,7 +94,7 @@ def _errors(
 
 
 def _named_in_turn(
-    problem: Problem, first: Chain, parts: Sequence[Observations], most: float, how: str
+    problem: Problem, first: Chain, parts: Sequence[Observations], most: float
 ) -> Suspect:
     """Return what is measured in turn, by the frame of the first that suits all others."""
     seen = parts[0]
@@ -159,12 +103,12 @@ def _named_in_turn(
         known = known.with_frame(shared, replace(first.frame(shared), fixed=True))
         if max(_errors(problem, known, parts[1:], most)) <= most:
             return Suspect(
-                f'the rows are of {len(parts)} {kind}s{how}',
+                f'the rows are of {len(parts)} {kind}s in turn',
                 f'name them in a column {kind}',
                 published=f'give each its own {kind} in sources',
             )
     return Suspect(
-        f'the rows are of {len(parts)} arms, devices or targets{how}',
+        f'the rows are of {len(parts)} arms, devices or targets in turn',
         'name them in a column session, and identify each alone (--session)',
         published='give each its own device in sources',
     )

@@ -95,8 +95,15 @@ ZERO = replace(FRAME, owners=('wire',), kind='zero', thing='the device', longer=
             replace(FRAME, where=f'line 5{IF_IN_ORDER}', later=LATER, unused=ASIDE),
             'the device moved by 1.2 mm (base) before line 5, by 1.2 mm before line 9, by -2 mm '
             'before line 20 (if rows are in the order of measurement); measurements with it '
-            'elsewhere carry no weight',
+            'elsewhere carry no weight; if these are several devices, name each (column device, '
+            'or sources)',
             'base moved by 1.2 mm before pose 7 and later again',
+        ),
+        (
+            replace(FRAME, kind='tool', later=LATER[1:]),
+            'the device moved by 1.2 mm (base) before row 5, by -2 mm before line 20; if these '
+            'are several targets, name each (column target, or sources)',
+            f'base moved by 1.2 mm before pose 7 and later again{AGAIN}',
         ),
         (
             replace(JOINT, size=-SIZE, later=LATER[1:]),
