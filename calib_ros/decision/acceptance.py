@@ -19,7 +19,7 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.rounding import resolution_in_words
 from calib_ros.decision.trials import position_fault_limit
-from calib_ros.estimation.configurations import STILL
+from calib_ros.estimation.configurations import STILL, count_distinct
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import ALIKE, MOST_OUTLIERS
@@ -46,7 +46,7 @@ def refusals(
     """
     failed, validation = [*_fit_refusals(problem, result, own_behaviour)], result.validation
     if validation is None:
-        count = len(np.unique(result.fitted.after.configurations))
+        count = count_distinct(result.fitted.after.configurations)
         text = f'{count} different poses: too few to hold some out'
         return (*failed, Reason(Rule.CONFIGURATIONS, text))
     share = validation.share_of_outliers

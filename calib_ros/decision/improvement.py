@@ -14,6 +14,7 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.scale import out_of_scale
 from calib_ros.decision.trials import position_fault_limit
+from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, CONFIDENT
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags
@@ -46,7 +47,7 @@ def gain_refusals(
     if not gain > limit:
         text = f'RMS {rounded(before.rms_mm)} mm before, {rounded(after.rms_mm)} mm after'
         if gain > 0.0:
-            count = len(np.unique(validation.after.configurations[judged]))
+            count = count_distinct(validation.after.configurations[judged])
             kind = 'locations' if all(each.socket for each in problem.sets) else 'poses'
             chance = before.rms_mm * np.exp(-limit)
             text += f'; with {count} {kind}, chance alone can lower it to {rounded(chance)} mm'

@@ -89,8 +89,7 @@ def may_be_rounding(fitted: Fitted, before: Chain, steps: Mapping[str, float]) -
     `before` is the nominal chain with fitted frames, `steps` belong to rounded joints.
     """
     problem, names = fitted.problem, fitted.names
-    pairs = zip(problem.sets, fitted.robust.inliers, strict=True)
-    sets = [each.spread(good=good) for each, good in pairs]
+    sets = fitted.good_sets()
     joints = np.concatenate([each.joints for each in sets])
     levels = {}
     for number, joint in enumerate(problem.chain.joints):

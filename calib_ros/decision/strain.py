@@ -36,10 +36,9 @@ def strain_of(fitted: Fitted) -> tuple[str, float]:
     with the strain if there is one, or zero if it is not most or frames are held.
     """
     problem, names = fitted.problem, fitted.names
-    pairs = zip(problem.sets, fitted.robust.inliers, strict=True)
     learned = problem.learned and replace(problem.learned, noise=1.0)  # of what is not fitted
     own_noise = replace(problem, learned=learned)
-    system = own_noise.system([each.select(good).spread() for each, good in pairs])
+    system = own_noise.system(fitted.good_sets())
     strained = strains(system.sets)
     if not (travels(fitted.chain) or any(each.any() for each in strained)):
         return '', 0.0

@@ -14,6 +14,7 @@ from scipy import special
 from calib_ros.estimation.levels import CONFIDENT, KNOWN
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.nuisances import Nuisances, nuisance_products
+from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import Robust
 from calib_ros.estimation.system import System
@@ -90,6 +91,11 @@ class Fitted:
     def system(self) -> System:
         """Return the samples with their weights in the fit."""
         return self.robust.system
+
+    def good_sets(self, most: int = SOME_POSES) -> list[Observations]:
+        """Return evenly spread samples of each set, at most `most`, without gross errors."""
+        pairs = zip(self.problem.sets, self.robust.inliers, strict=True)
+        return [each.select(good).spread(most) for each, good in pairs]
 
     @cached_property
     def offsets(self) -> FloatArray:

@@ -184,11 +184,10 @@ class Observations(Shown):
             vars(chosen)['configurations'] = renumber(self.configurations[mask])
         return chosen
 
-    def spread(self, most: int = SOME_POSES, good: Flags | None = None) -> Observations:
-        """Return evenly spread pairs, at most `most`, of the `good` ones (N,) if given."""
-        rows = np.arange(len(self)) if good is None else np.flatnonzero(good)
-        few = rows[:: max(1, -(-len(rows) // most))]
-        return self if len(few) == len(self) else self.select(few)
+    def spread(self, most: int = SOME_POSES) -> Observations:
+        """Return evenly spread pairs, at most `most`."""
+        stride = -(-len(self) // most)
+        return self if stride < 2 else self.select(np.arange(0, len(self), stride))
 
     def some_images(self) -> Observations:
         """Return evenly spread images with all their rows, at most SOME_POSES."""

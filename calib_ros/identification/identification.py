@@ -87,11 +87,12 @@ def _identified(
     explained = simpler.validation.judged if simpler and simpler.validation else None
     progress(2 / 3)
     validation, validated_by = validate(fitted, before.chain, explained)
-    coarse, share = rounded_joints(problem), coupling_share(fitted)
+    coarse, by_couplings = rounded_joints(problem), coupling_share(fitted)
     more = considered(chain, names, problem.fixed, problem.sets)
-    (strain, beside), coarsely = strain_of(fitted), rounding_errors(problem, coarse)
-    noise, least = _size(fitted, share), _size(fitted, beside)  # couplings are no strain
-    inference = Inference(fitted, noise, more, coarsely, bool(strain), least)
+    (strain, by_strain), rounding = strain_of(fitted), rounding_errors(problem, coarse)
+    # of the least noise couplings are a part: they are no strain
+    noise, least = _size(fitted, by_couplings), _size(fitted, by_strain)
+    inference = Inference(fitted, noise, more, rounding, bool(strain), least)
     posterior, uncertainty = _inferred(inference)
     surprise, wider = held_out_excess(fitted, posterior, validation)
     uncertainty = replace(uncertainty, parts=wider**2 * uncertainty.parts)
@@ -123,14 +124,14 @@ def _identified(
         weak=_weak(problem, parameters),
         step=step,
         remarks=oddities(problem, posterior, step, coarse),
-        coupled=share > 0.0,
+        coupled=by_couplings > 0.0,
         surprise=surprise,
         strain=strain,
         images=sum(count_distinct(s.images) for s in problem.sets if s.pixels is not None),
     )
     own_behaviour = None if step and not step.slow else arms_own(fitted)
-    rounding = may_be_rounding(fitted, before.chain, coarse)
-    refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None, scaled)
+    by_rounding = may_be_rounding(fitted, before.chain, coarse)
+    refused = refusals(problem, result, own_behaviour, by_rounding, fitted.held is None, scaled)
     result = replace(result, refusals=(*result.refusals, *refused))
     named = mistakes.with_mistake(problem, result)
     return plausibility.add_remarks(problem, named, another=named is result)
@@ -205,11 +206,10 @@ def _chance(fitted: Fitted, before: Chain) -> float | None:
     problem, names = fitted.problem, fitted.names
     if any(each.socket for each in problem.sets):
         return None
-    pairs = zip(problem.sets, fitted.robust.inliers, strict=True)
-    sets = [each.spread(SOME, good) for each, good in pairs]
     frames = [name for name in names if before.owns_frame(name)]
     arm = [name for name in names if not before.owns_frame(name)]
-    return chance_of_gain(before, frames, arm, replace(problem, learned=None).system(sets))
+    system = replace(problem, learned=None).system(fitted.good_sets(SOME))
+    return chance_of_gain(before, frames, arm, system)
 
 
 def _weak(problem: Problem, parameters: Sequence[ParameterRow]) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import numpy as np
 from calib_ros.annotated import as_annotated
 from calib_ros.decision.result import Identification
 from calib_ros.errors import InputError, TooFewObservationsError
-from calib_ros.estimation.configurations import configurations
+from calib_ros.estimation.configurations import configurations, count_distinct
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
@@ -210,7 +210,7 @@ class CalibrationSession:
         fitted = [sample.joints for sample in self.samples if not sample.validation]
         usable, distinct = self.usable, len(fitted)
         if self.settings.mode != 'continuous' and fitted:
-            distinct = len(np.unique(configurations(np.array(fitted))))
+            distinct = count_distinct(configurations(np.array(fitted)))
         collector = self._collector
         notes = collector.notes.copy()
         if left_out := len(self.samples) - len(usable):
