@@ -66,8 +66,13 @@ class DeferredTrigger:
 
     def _begin(self, *given: Any) -> None:
         self._running.set()
-        self._thread = threading.Thread(target=self._run, args=given, daemon=True)
-        self._thread.start()
+        thread = threading.Thread(target=self._run, args=given, daemon=True)
+        try:
+            thread.start()
+        except RuntimeError:  # too many processes: it is done here, and messages wait
+            self._run(*given)
+        else:
+            self._thread = thread
 
     def _run(self, snapshot: Any, response: Any, send: Callable[[Any], None]) -> None:
         response.success, response.message = self._answer(lambda: self._work(snapshot))
