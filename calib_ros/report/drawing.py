@@ -19,15 +19,15 @@ from matplotlib.ticker import MultipleLocator
 
 def blank_figure(width: float, height: float) -> Figure:
     """Return an empty figure, sizes in inches."""
-    figure = Figure(figsize=(width, height), layout='constrained')
+    figure = Figure(figsize=(width, height), layout='constrained', dpi=120)
     FigureCanvasAgg(figure)
     return figure
 
 
 def png_of(figure: Figure) -> bytes:
-    """Return a figure as PNG."""
+    """Return such a figure as PNG; `savefig` would lay it out twice."""
     image = BytesIO()
-    figure.savefig(image, format='png', dpi=120)
+    FigureCanvasAgg(figure).print_png(image)  # type: ignore[no-untyped-call]
     return image.getvalue()
 
 
