@@ -30,7 +30,8 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of
 from calib_ros.report import documents, reports, update, words
-from calib_ros.report.advice import BRINGS, FAR
+from calib_ros.report.advice import BRINGS, FAR, UNSURE
+from calib_ros.report.advised import advice_of
 from calib_ros.report.content import Origin
 from calib_ros.report.gathered import poses_of, poses_to_verify
 from calib_ros.report.markdown import markdown
@@ -263,7 +264,7 @@ def show(found: Identified, screen: Screen) -> None:
     result = found.result
     if found.loaded.read:
         screen.say(found.loaded.read)
-    reasons = reports.advice_of(found.loaded.problem, result)
+    reasons = advice_of(found.loaded.problem, result)
     verdict = reports.result_standing(result, reasons, found.wanted)
     screen.title(verdict.heading, GOOD_OR_BAD.get(verdict.state))
     screen.table(_rows(result))
@@ -288,7 +289,7 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
     if not all(each.steps for each in reasons):
         screen.bullet('What else was found probably follows from it: the report (--out) lists it')
         return
-    explained = BRINGS.keys() & {each.rule for each in result.refusals}
+    explained = (BRINGS.keys() - UNSURE) & {each.rule for each in result.refusals}
     if not explained and 1.0 < result.noise.position < FAR and not result.noise.consistent:
         screen.bullet(words.scatter_in_words(result.noise))
 

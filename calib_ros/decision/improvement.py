@@ -62,7 +62,7 @@ def gain_refusals(
     elif scaled and not result.surprise:
         printed = all(each.pixels is not None for each in problem.sets)
         text = out_of_scale(scaled, printed, problem.sigma_scale, result.posterior.strain)
-        yield Reason(Rule.SCALE, result.strain or text)
+        yield Reason.with_remedy(Rule.SCALE, result.strain or text)
     elif result.region is not None and result.surprise and before.rms_mm < ALIKE * after.rms_mm:
         yield Reason(
             Rule.REGION,

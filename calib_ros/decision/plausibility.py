@@ -229,7 +229,8 @@ def _lag(problem: Problem, result: Identification) -> Identification:
         return result
     text, other = found
     if other is not None and _imitated(other, result):
-        return replace(result, refusals=(*result.refusals, Reason(Rule.LAG, text)))
+        reason = Reason.with_remedy(Rule.LAG, text)
+        return replace(result, refusals=(*result.refusals, reason))
     return replace(result, remarks=(*result.remarks, text))
 
 

@@ -8,7 +8,7 @@ from enum import Enum
 
 Rule = Enum(
     'Rule',
-    'LAG MISTAKE SCALE CONFIGURATIONS ENCODER MOVED OWN_BEHAVIOUR EXCITATION COMMON_SENSE '
+    'LAG MISTAKE CONFIGURATIONS ENCODER MOVED OWN_BEHAVIOUR EXCITATION SCALE COMMON_SENSE '
     'LARGEST_ERROR CONVERGENCE OUTLIERS GAIN DRIFT REGION GAIN_WITH_OUTLIERS ROUNDING '
     'ORIENTATION UNKNOWN_LOSS UNREADABLE DROPPED POSED',
 )
@@ -27,6 +27,12 @@ class Reason(str):
         reason = super().__new__(cls, short + more)
         reason.rule, reason.short = rule, short
         return reason
+
+    @classmethod
+    def with_remedy(cls, rule: Rule, text: str) -> Reason:
+        """Return the text, whose sentences after the first say what to do."""
+        short, *more = text.partition('. ')
+        return cls(rule, short, ''.join(more))
 
     def __getnewargs__(self) -> tuple[Rule, str, str]:  # type: ignore[override]
         return self.rule, self.short, self.removeprefix(self.short)

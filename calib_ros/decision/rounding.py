@@ -68,6 +68,17 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
     return found
 
 
+def error_by_rounding(problem: Problem) -> float:
+    """Return the RMS position error [m] of the flange that rounded joint values cause."""
+    joints, chain = np.concatenate([each.joints for each in problem.sets]), problem.chain
+    coarse, squares = rounded_joints(problem), 0.0
+    for number in np.flatnonzero([name in coarse for name in chain.joint_names]):
+        step = coarse[chain.joint_names[number]] * (np.arange(joints.shape[1]) == number)
+        moved = (chain.forward(joints + step) - chain.forward(joints))[:, :3, 3]
+        squares += float(np.mean(np.sum(moved**2, axis=-1))) / 12.0
+    return float(np.sqrt(squares))
+
+
 def resolution_of(values: FloatArray) -> float:
     """Return the step [rad or m] of which values (N,) are multiples; 0 for none."""
     few = values[:3, np.newaxis] / RESOLUTIONS

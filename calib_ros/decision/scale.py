@@ -33,7 +33,7 @@ def scale_reasons(problem: Problem, result: Identification) -> Iterator[Reason]:
         if problem.sigma_scale:
             again = 'measure a known length, or the printed board, again'
             text = f'{_grown(found.scale, found.strain)}, more than sigma_scale allows: {again}'
-        yield Reason(Rule.SCALE, result.strain or text)
+        yield Reason.with_remedy(Rule.SCALE, result.strain or text)
 
 
 def out_of_scale(

@@ -27,11 +27,12 @@ BRINGS = {
     Rule.MISTAKE: {*WRONG, Rule.SCALE, Rule.ENCODER, Rule.MOVED},
     Rule.SCALE: WRONG,
     Rule.CONFIGURATIONS: {Rule.ENCODER, Rule.MOVED},
-    Rule.ENCODER: {*UNSURE, Rule.OUTLIERS},
-    Rule.MOVED: {*UNSURE, Rule.OUTLIERS},
-    Rule.EXCITATION: UNSURE,
+    Rule.ENCODER: {*UNSURE, Rule.OUTLIERS, Rule.LARGEST_ERROR, Rule.ORIENTATION},
+    Rule.MOVED: {*UNSURE, Rule.OUTLIERS, Rule.LARGEST_ERROR, Rule.ORIENTATION},
+    Rule.EXCITATION: {*UNSURE, Rule.ORIENTATION},
     Rule.COMMON_SENSE: WRONG,
     Rule.LARGEST_ERROR: WRONG,
+    Rule.GAIN: {Rule.ORIENTATION},
 }
 """Consequences of each cause; the first cause told counts."""
 
@@ -51,6 +52,11 @@ DRIFTS = (
     'Poses measured in succession have similar errors, as if the device drifted: let it warm up '
     'as long as its manual says, then measure all poses again in random order.'
 )
+DIGITS = (
+    'Record the joint values with all their digits: their rounding alone causes an error of about '
+    '{:.2g} mm.'
+)
+"""First step if rounded joint values explain most of what is left."""
 FINER = (
     'If the device is accurate to less than {:.2g} mm by its data sheet, state that '
     '(--sigma-position, in metres): the measurements scatter by only {:.2g} mm.'
@@ -73,7 +79,8 @@ class Situation:
     """Different poses, residual over stated noise, that noise [m], and what else is known.
 
     Whether poses share errors in succession only, how many are outliers, whether chosen held-out
-    poses are further off than expected, and which marks in `refusals.md` make a step needless.
+    poses are further off than expected, which marks in `refusals.md` make a step needless, and the
+    error [mm] by rounded joint values if it is at least half of what is left.
     """
 
     poses: int = ENOUGH
@@ -83,9 +90,12 @@ class Situation:
     outliers: int = 0
     contradicted: bool = False
     needless: tuple[str, ...] = ()
+    rounding: float = 0.0
 
     def first_of(self, rule: Rule) -> tuple[str, ...]:
         """Return what to do before the steps of a rule."""
+        if rule in {*UNSURE, Rule.LARGEST_ERROR} and self.rounding:
+            return (DIGITS.format(self.rounding),)
         if rule in {Rule.GAIN, Rule.LARGEST_ERROR} and self.contradicted:
             return (IN_BETWEEN,)
         if rule is Rule.LARGEST_ERROR and self.outliers:
@@ -98,7 +108,7 @@ class Situation:
 
     def said_of(self, one: Advice) -> Advice:
         """Return the advice on an unproven correction that suits the situation."""
-        if self.left >= FAR:
+        if self.left >= FAR and not self.rounding:
             return replace(one, steps=(COARSE.format(self.left), *one.steps))
         if self.poses < ENOUGH:
             marked = zip(one.steps, one.unless, strict=True)
@@ -132,7 +142,8 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
         kept = [each for each in marked if each[1] not in needless]
         steps, unless = (tuple(each[k] for each in kept) for k in (0, 1))
         told = replace(general, steps=steps, unless=unless)
-        refusal = replace(told, refusal='; '.join(texts), in_short=short)
+        named = texts if rule is Rule.MISTAKE else [each.short for each in texts]  # the steps tell
+        refusal = replace(told, refusal='; '.join(named), in_short=short)
         if rule in UNSURE:
             refusal = situation.said_of(refusal)
         first = situation.first_of(rule)

@@ -16,6 +16,7 @@ from calib_ros.apply.verified import Verification
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.fitted import ParameterRow
+from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import words
 from calib_ros.report.remarks import remarks
 from calib_ros.settings import Settings
@@ -74,6 +75,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'step': None if result.step is None else asdict(result.step),
         'samples': samples,
         'robot': result.chain.name,
+        'table_sha256': table_hash(result.chain) if result.accepted else None,
         'versions': {
             'calib_ros': calib_ros.__version__,
             'python': platform.python_version(),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 
@@ -31,7 +31,7 @@ class Advice:
     refusal: str = ''  # the sentence of its rule
     again: str = AGAIN  # what to identify next
     in_short: str = ''  # the heading, with the mistake if there is one
-    sound: bool = False  # whether the arm shows no errors
+    sound: str = ''  # the verdict, if the arm shows no errors
     unless: tuple[str, ...] = ()  # for each step, when it is needless
 
     @property
@@ -67,13 +67,14 @@ GOOD_ARM = Advice(
     'The error is within the stated noise of the measuring device: the arm is as good as this '
     'device can see.',
     ('To look for smaller errors, measure with a more accurate device.',),
-    sound=True,
+    sound='Nothing to correct',
 )
 """Instead of `Rule.GAIN`, if the error before is within the noise."""
-GOOD_HERE = replace(
-    GOOD_ARM,
-    meaning='At these poses the error is within the stated noise of the measuring device. '
+GOOD_HERE = Advice(
+    'At these poses this device sees nothing to correct',
+    'At these poses the error is within the stated noise of the measuring device. '
     'Elsewhere it may be larger: these poses tell little about the rest of the joint range.',
-    steps=('Add poses all over the workspace, each joint moved through most of its range.',),
+    ('Add poses all over the workspace, each joint moved through most of its range.',),
+    sound='Nothing to correct at these poses',
 )
 """The same if the poses do not determine the error elsewhere."""

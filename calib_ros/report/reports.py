@@ -13,9 +13,7 @@ from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.judgement import compared
 from calib_ros.apply.workspace import survey
 from calib_ros.decision.comparison import Comparison
-from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
-from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
@@ -25,12 +23,13 @@ from calib_ros.identification.linear_model import COMPARED
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.effects import group_of
 from calib_ros.report import figures, sections, words
-from calib_ros.report.advice import SPREAD_OUT, Situation, advice
+from calib_ros.report.advice import SPREAD_OUT
+from calib_ros.report.advised import advice_of
 from calib_ros.report.content import Headline, Origin, Report, Section, section
 from calib_ros.report.explorer import explorer
 from calib_ros.report.gathered import poses_of
 from calib_ros.report.poses import Poses
-from calib_ros.report.refusals import GOOD_ARM, GOOD_HERE, Advice
+from calib_ros.report.refusals import Advice
 from calib_ros.settings import Settings
 from calib_ros.shown import counted, rounded, sentence, some
 
@@ -63,7 +62,7 @@ def identification_report(
     poses = poses or poses_of(problem, result, loaded.by_line, loaded.images)
     reasons = advice_of(problem, result)
     text = filter(None, _text(result, reasons, tolerance))
-    shown = 2 if result.accepted else int(_sound(reasons))
+    shown = 2 if result.accepted else int(bool(_sound(reasons)))
     gain = sections.gain(judged, count=shown) if shown else ''
     fitted = [counted(result.rank, 'parameter')]
     fitted += words.notes(result)[:1] if result.chain.effects else []
@@ -121,9 +120,9 @@ def result_standing(
         heading = f'Accepted{"" if whole else " near the measured poses"}{within}'
         heading += ': check first' * bool(result.remarks)
         return Headline('open' if open_yet else 'good', heading)
-    if _sound(reasons):
+    if good := _sound(reasons):
         within, _ = _within(result.validation or result.fitted, tolerance, 0)
-        return Headline('info', f'Nothing to correct{within}: the robot stays as it was')
+        return Headline('info', f'{good}{within}: the robot stays as it was')
     return Headline('bad', 'Not accepted: the robot stays as it was')
 
 
@@ -157,9 +156,9 @@ def doubts(result: Identification) -> tuple[str, ...]:
     return tuple(sentence(f'Check before you use it: {each}') for each in result.remarks)
 
 
-def _sound(reasons: Sequence[Advice]) -> bool:
-    """Tell whether a result is refused because the arm shows no errors."""
-    return any(each.sound for each in reasons)
+def _sound(reasons: Sequence[Advice]) -> str:
+    """Return the verdict on a result refused because the arm shows no errors; else empty."""
+    return next((each.sound for each in reasons if each.sound), '')
 
 
 def _within(judged: Comparison, tolerance: float | None, when: int = 1) -> tuple[str, bool]:
@@ -171,34 +170,6 @@ def _within(judged: Comparison, tolerance: float | None, when: int = 1) -> tuple
     if verdict == 'PASS':
         return f' and {wanted}', True
     return f', but {"" if verdict == "FAIL" else "perhaps "}not {wanted}', False
-
-
-def advice_of(problem: Problem, result: Identification) -> tuple[Advice, ...]:
-    """Return why a result was refused, in plain words, and what to do.
-
-    What the fit left, by its ratio to the stated noise, is that noise in the same figure. A fit of
-    few poses leaves less, and does not show that an arm is good.
-    """
-    if result.accepted:
-        return ()
-    judged, noise = result.validation, result.noise.position
-    if judged is not None and {each.rule for each in result.refusals} == {Rule.GAIN}:
-        lower, upper = interval_of(judged, 0)
-        if upper < np.inf and 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
-            known = words.sigma_over_range(result)['median'] < judged.figures[0].rms_mm
-            good = GOOD_ARM if known else GOOD_HERE
-            return (replace(good, refusal='; '.join(result.refusals)),)
-    held_out = () if judged is None or judged.repeated is None else (judged,)
-    numbers = (each.after.configurations for each in (result.fitted, *held_out))
-    poses = sum(map(count_distinct, numbers))
-    sigma = None if result.images else result.noise.given.get('sigma_position')
-    contradicted = bool(held_out) and bool(result.surprise)
-    wires = any(each.of_wire for each in problem.all_sets)
-    marks = {'auto': result.verdicts, 'table': not problem.of_messages, 'no_wires': not wires}
-    marks |= {'images': result.images, 'no_images': not result.images}
-    needless = tuple(mark for mark, holds in marks.items() if holds)
-    about = words.drifts(result.noise), len(result.outliers), contradicted, needless
-    return advice(result.refusals, Situation(poses, noise, sigma, *about))
 
 
 def may_be_closer(result: Identification, beyond: bool = False) -> bool:

@@ -42,7 +42,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Progress
 from calib_ros.report import words
-from calib_ros.report.reports import advice_of
+from calib_ros.report.advised import advice_of
 from calib_ros.ros import to_ros
 from calib_ros.ros.boundary import Answer
 from calib_ros.ros.inputs import Inputs

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from measured import TRAIN, UR, measured
+from measured import TRAIN, TRUE, UR, measured
 from pages import page_of, report_of
 
 from calib_ros import Problem, identify, load_chain
@@ -15,8 +15,8 @@ from calib_ros.decision.diagnosis import Diagnosis
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.undoing import Suspect
 from calib_ros.report import advice, refusals
+from calib_ros.report.advised import advice_of
 from calib_ros.report.markdown import markdown
-from calib_ros.report.reports import advice_of
 
 
 @pytest.mark.parametrize('auto', [False, True])
@@ -104,6 +104,52 @@ def test_errors_shared_in_succession_ask_for_random_order_first():
     report = report_of(problem, identify(problem))
     assert report.advice[0].steps[0] == advice.DRIFTS
     assert report.steps == (told.again,)
+
+
+@pytest.mark.parametrize('cause', [Rule.ENCODER, Rule.MOVED])
+def test_what_moved_explains_the_large_error_left(cause):
+    """Chain, units and order were to be checked besides, of an arm whose base moved by 62 mm."""
+    found = [Reason(cause, 'moved'), Reason(Rule.LARGEST_ERROR, 'RMS 32 mm remains')]
+    moved, others = advice.advice(found)
+    assert moved.steps == refusals.rules()[cause].steps
+    assert (others.steps, others.refusal) == ((), 'RMS 32 mm remains')
+
+
+def test_a_joint_that_stood_still_is_told_before_the_scale():
+    """Its step is to move the joint; the scale is judged again then."""
+    assert Rule.EXCITATION.value < Rule.SCALE.value
+
+
+def test_a_remedy_is_told_once():
+    """On the page the sentence of the rule and the last step told the same."""
+    reason = Reason.with_remedy(Rule.SCALE, 'lengths shrink. If that is right, set sigma_scale')
+    (told,) = advice.advice([reason], advice.Situation(needless=('images', 'no_linear')))
+    assert (str(reason)[-11:], told.refusal) == ('sigma_scale', 'lengths shrink')
+    assert 'linear joint' not in ' '.join(told.steps)
+
+
+@pytest.mark.parametrize(
+    ('digits', 'first'), [(2, 'Record the joint values'), (3, 'The remaining')]
+)
+def test_rounded_joint_values_are_named_only_if_they_explain_the_error(digits, first):
+    """Device and target were to be fastened, of values with two digits."""
+    rows = measured(count=60)
+    noise = np.random.default_rng(1).normal(0.0, 4e-3 * (digits == 3), rows.positions.shape)
+    coarse = replace(rows, joints=rows.joints.round(digits), positions=rows.positions + noise)
+    problem = Problem(UR, coarse)
+    (told,) = advice_of(problem, identify(problem))
+    assert told.steps[0].startswith(first)
+
+
+@pytest.mark.parametrize(
+    ('offsets', 'first'),
+    [({'elbow_joint.theta': 0.15}, 'If only zeros'), ({'elbow_joint.a': 0.07}, 'Check that the')],
+)
+def test_mastering_is_the_first_step_if_only_zeros_are_off(offsets, first):
+    problem = Problem(UR, measured(TRUE.with_offsets(offsets)))
+    (told,) = advice_of(problem, identify(problem))
+    assert told.steps[0].startswith(first)
+    assert ('largest_length' in ' '.join(told.steps)) == ('elbow_joint.a' in offsets)
 
 
 @pytest.mark.parametrize(('needless', 'count'), [(('table',), 2), ((), 3)])
@@ -198,7 +244,8 @@ def test_a_refused_page_says_why_and_what_to_do():
     for each in advice.advice(result.refusals):
         assert each.heading in page.text
         assert f'{each.refusal}.' in page.text
-        assert f'{each.found}\n\n**What to do:**\n\n1. ' in markdown(report, {})
+        told = f'{each.found}\n\n**What to do:**\n\n1. ' if each.steps else each.found
+        assert told in markdown(report, {})
     assert 'none: not accepted' in page.text
     assert 'map' not in page.data['figures']
 

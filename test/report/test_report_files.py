@@ -66,6 +66,7 @@ def test_identify_writes_what_it_was_told(table, run, tmp_path):
     assert document['tolerance_mm'] == 5.0
     shown = re.search('[0-9a-f]{64}', page.text)[0]
     assert f'table_sha256: {shown}' in (out / 'calibration.yaml').read_text()
+    assert document['table_sha256'] == shown
 
 
 def of_the_certificate(report, monkeypatch):
