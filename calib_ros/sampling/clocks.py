@@ -114,7 +114,8 @@ class Clocks:
             return
         known = self._seen
         every = (found.seconds, *found.rivals)  # SMOOTHING is the resolution of speeds
-        if known is None or min(abs(each - known.seconds) for each in every) > SMOOTHING:
+        least = max(SMOOTHING, found.within, known.within if known else 0.0)
+        if known is None or min(abs(each - known.seconds) for each in every) > least:
             if found.rivals:
                 self._unclear = found if known is None else None
                 return

@@ -41,6 +41,8 @@ class Delay:
     seconds: float
     correlation: float
     rivals: tuple[float, ...] = ()  # [s] explain repetitive motion nearly as well
+    within: float = 0.0
+    """Longest time [s] to a delay that, as all in between, explains the motion nearly as well."""
 
 
 def find_delay(
@@ -92,9 +94,11 @@ def find_delay(
     shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
     others = peaks(score, RISE)
     apart = np.sqrt(1.0 - np.maximum(score, 0.0) ** 2)
-    rivals = others[(others != best) & (apart[others] < ALIKE * apart[best])]
+    alike = apart < ALIKE * apart[best]
+    rivals = lags[others[(others != best) & alike[others]]].tolist()
+    reach = max(int(np.argmin(np.append(a, False))) for a in (alike[best::-1], alike[best:]))
     seconds = float(lags[best] + shift * STEP)
-    return Delay(seconds, float(score[best]), tuple(lags[rivals].tolist()))
+    return Delay(seconds, float(score[best]), tuple(rivals), STEP * reach)
 
 
 def peaks(score: FloatArray, rise: float) -> Index:

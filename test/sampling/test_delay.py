@@ -126,6 +126,23 @@ def test_a_target_that_was_carried_to_the_arm_stays_in_the_account_alone():
     assert (stood.status, stood.explains) == ('', False)
 
 
+@pytest.mark.parametrize('jump', [0.0, 0.5])
+def test_a_delay_known_roughly_is_no_shift_of_the_clocks(jump):
+    """By positions alone it is off by up to a tenth of a second in smooth motion: the target is
+    not the flange.
+    """
+    true, motion, rng = true_cell(1)
+    joint_times, times = np.arange(0.0, 60.0, 0.01), np.arange(0.05, 59.0, 0.02)
+    seen = measure(true, motion(times), rng, *NOISE, oriented=False)
+    session = CalibrationSession(UR10E, Settings(mode='continuous'))
+    for k in range(0, 60, 15):
+        known, now = (each // 15 == k // 15 for each in (joint_times, times))
+        of_joints, lag = motion(joint_times[known]), 0.02 + jump * (k >= 30)
+        given = times[now], seen.positions[now], None, lag
+        told(session, joint_times[known], of_joints, *given)
+    assert any('clocks shifted' in each.status for each in session.hints) == (jump > 0.0)
+
+
 @pytest.mark.parametrize('last', [9.9, 10.25, None])  # at rest, on the way, never
 def test_joint_states_that_freeze_are_told(last):
     """Where they go on nothing is told, though the target is lost for a tenth of the time."""
