@@ -169,7 +169,12 @@ def shared_files(folder: str) -> dict[str, Path]:
 def parse_chain(text: str, where: str = 'chain file') -> Chain:
     """Parse the text of a chain file; errors name it `where`."""
     document = parse_yaml(text, where)
-    content = parse_mapping(document, CHAIN_KEYS, where, ('convention', 'joints'))
+    if isinstance(document, dict) and 'units' in document:
+        fixed = 'lengths are in metres, angles in radians'
+        raise UnknownNameError(f'{where}: key', 'units', CHAIN_KEYS, fixed)
+    content = parse_mapping(document, CHAIN_KEYS, where, ('joints',))
+    if content.get('convention') is None:
+        raise ConfigError(f'{where}: key "convention" is missing: standard or modified')
     rows = content['joints']
     if not isinstance(rows, list) or not rows:
         raise ConfigError(
