@@ -27,6 +27,7 @@ KIND_OF_SUFFIX = {
     **dict.fromkeys(images.SUFFIXES, 'image'),
     **dict.fromkeys(('.html', '.pdf', '.md', '.json'), 'report'),
     **dict.fromkeys(TABLES, 'table'),
+    **dict.fromkeys(('.zip', '.tar', '.tgz', '.gz', '.7z', '.rar'), 'archive'),
     **dict.fromkeys(('.xls', '.xlsb', '.ods', '.numbers'), 'workbook'),
 }
 IN_FOLDERS = (('metadata.yaml', 'bag'), ('result.json', 'result'), ('calibration.yaml', 'result'))
@@ -44,6 +45,7 @@ FILE_KINDS = {
     'image': ('an image', 'use calib_ros images on its folder'),
     'images': ('a folder of images', 'use calib_ros images'),
     'workbook': ('a workbook of another kind', 'save it as .xlsx or CSV'),
+    'archive': ('an archive', 'unpack it and give what is in it'),
     'report': ('a report', 'read it; calibration.yaml beside it is the result'),
 }
 

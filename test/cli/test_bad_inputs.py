@@ -96,6 +96,7 @@ def bad_inputs():
     yield 'a folder as calibration', ('compare', 'folder', 'none'), 'folder holds no calibration.y'
     yield 'a record of its own', ('compare', 'own.yaml', 'none'), 'by calib_ros identify or, where'
     yield 'a table as calibration', ('compare', 'good.csv', 'none'), 'is a table, but compare'
+    yield 'an archive', (*bag_of, 'poses.zip'), 'is an archive, but identify takes a table or a b'
     yield 'a picture as chain', (*chain_of, 'shot.png'), 'shot.png is no chain file'
     yield (
         'a program of KUKA',
@@ -148,6 +149,7 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     (tmp_path / 'universal.csv').write_text('def cal():\n  movej([1.0, 2.0])\nend\n')
     (tmp_path / 'start.dtx').write_text('<?xml version="1.0"?><Database/>')
     (tmp_path / 'poses.XLSX').write_bytes(b'PK\3\4\0')
+    (tmp_path / 'poses.zip').write_bytes(b'PK\3\4\0')
     (tmp_path / 'shot.png').write_bytes(b'\x89PNG\xff')
     for folder, file in (('folder', ''), ('refused', 'result.json'), ('shots', '1.pgm')):
         (tmp_path / folder).mkdir()

@@ -221,7 +221,9 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
     assert '&lt;C&gt;' in page
     assert '<C>' not in page
     own = History('history').rows('<C>')[-1]
-    assert f'href="robots/%253CC%253E/{own.key}.html"' in page
+    link = f'<a href="robots/%253CC%253E/{own.key}.html">&lt;C&gt;</a>'
+    assert f'<h3>{link}</h3>' in page
+    assert f'<td class="robot">{link}</td>' in page
     robots = (folder / f'report/robots/%3CC%3E/{own.key}.html').read_text()
     assert 'within the tolerance of 0.3\xa0mm RMS' in robots
     assert len(pandas.read_parquet('history')) == 11
