@@ -36,6 +36,7 @@ from calib_ros.decision.trials import (
     sample_errors,
     set_in_words,
     trial_of,
+    trials_of,
 )
 from calib_ros.decision.undoing import Sets, Suspect
 from calib_ros.estimation.levels import (
@@ -197,7 +198,7 @@ def _best_trials(
 
     With `of_rows` only mistakes made in each row alone.
     """
-    rough, of_images = [], _has_images(problem)
+    tried, of_images = list[tuple[Suspect, Chain, Sets]](), _has_images(problem)
     likely = suspects(chain, given.sets, of_images)
     for each in (*likely, *orders.in_any_order(chain, given.sets[0], of_images)):
         if of_rows and (each.chain is not None or not each.changes):
@@ -205,12 +206,12 @@ def _best_trials(
         few = given.sets
         if each.rows:
             few = tuple(_shift_joints(problem, one, each.rows).spread() for one in sets)
-        found = trial_of(each.chain or chain, each.undo_in(few))
-        if found.share < given.share:
-            rough.append((found, each))
-    best = sorted(rough, key=lambda one: one[0].share)[:TRIED]
-    tried = [(refine_trial(problem, found), each) for found, each in best]
-    return sorted(tried, key=lambda one: one[0].share)
+        tried.append((each, each.chain or chain, each.undo_in(few)))
+    rough = zip(trials_of(one[1:] for one in tried), (each for each, *_ in tried), strict=True)
+    better = (one for one in rough if one[0].share < given.share)
+    best = sorted(better, key=lambda one: one[0].share)[:TRIED]
+    refined = [(refine_trial(problem, found), each) for found, each in best]
+    return sorted(refined, key=lambda one: one[0].share)
 
 
 def _named(
@@ -323,12 +324,15 @@ def _beam_search(problem: Problem, chain: Chain, given: Trial) -> Diagnosis | No
     kept: list[tuple[Suspect, ...]] = [()]
     for number in range(SEVERAL + 1):  # several of joints, one of the poses
         found: dict[float, tuple[Trial, tuple[Suspect, ...]]] = {}
+        tried = list[tuple[Suspect, ...]]()
         together = [(*these, each) for these in kept for each in options]
         for these in together if number else [*together, *hidden(chain, options)]:
             if len({one.part for one in these}) == len(these):
                 more = tuple(sorted(these, key=lambda one: (*FIRST, one.part).index(one.part)))
-                trial = trial_of(chain, reduce(lambda sets, one: one.undo_in(sets), more, few))
-                found.setdefault(round(trial.share, 6), (trial, more))  # first of equivalent ones
+                tried.append(more)
+        undone = (reduce(lambda sets, one: one.undo_in(sets), more, few) for more in tried)
+        for more, trial in zip(tried, trials_of((chain, sets) for sets in undone), strict=True):
+            found.setdefault(round(trial.share, 6), (trial, more))  # first of equivalent ones
         best = [found[key] for key in sorted(found)[:TRIED]]
         if not best or (number and best[0][0].share > CONFIDENT * least):
             return None

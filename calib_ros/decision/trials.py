@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,7 +25,8 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME
-from calib_ros.kinematics.se3 import Flags, FloatArray
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.walk import BLOCK
 from calib_ros.settings import EXCEPTION, LEVER
 
 
@@ -48,7 +49,7 @@ class Trial:
         """Return the error [m] that a usual share of the samples is within."""
         pairs = zip(self.sets, self.arms, strict=True)
         sizes = [sample_errors(self.chain, each, arm) for each, arm in pairs]
-        return _usual(np.concatenate(sizes))
+        return float(_usual(np.concatenate(sizes)))
 
     @property
     def share(self) -> float:
@@ -58,31 +59,93 @@ class Trial:
 
 def trial_of(chain: Chain, sets: Sets) -> Trial:
     """Return the chain with frames for some samples in closed form, set by set."""
-    spreads, arms = [], []
-    for each in sets:
-        alone = each.changed(base='base', tool='tool')
-        arm = flange(chain, alone)
-        known = chain.all_frames  # other robots have only a base and a tool
-        own = replace(chain, base=known.get(each.base), tool=known.get(each.tool))
-        best = _nearest(own, alone, arm, np.ones(len(alone), dtype=bool))
-        away = sample_errors(best.chain, alone, arm)  # a gross error would hide a mistake
-        usual = away <= _usual(away)
-        if np.count_nonzero(usual) >= 2 * IN_A_FRAME:  # base and tool explain fewer
-            best = min(best, _nearest(own, alone, arm, usual), key=lambda one: one.error)
-        places = arm[:, :3, 3]
-        fixed = each.socket or each.seen
-        seen = places if fixed else each.positions  # sockets measure nothing
-        spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (places, seen)))
-        chain = chain.with_frame(each.base, best.chain.frame('base'))
-        chain = chain.with_frame(each.tool, best.chain.frame('tool'))
-        arms.append(arm)
-    return Trial(chain, sets, tuple(arms), float(np.median(spreads)))
+    return trials_of(((chain, sets),))[0]
 
 
-def _usual(sizes: FloatArray) -> float:
-    """Return the size that a usual share of (N,) is within; np.quantile is slow."""
-    last = int((1.0 - MOST_OUTLIERS) * (len(sizes) - 1))
-    return float(np.partition(sizes, last)[last])
+def trials_of(tried: Iterable[tuple[Chain, Sets]]) -> list[Trial]:
+    """Return what `trial_of` returns of each chain and its samples.
+
+    Samples of one chain that are as many and of one kind are computed at once.
+    """
+    tried, alike = [*tried], dict[tuple[object, ...], list[int]]()
+    for number, (chain, sets) in enumerate(tried):
+        kind = (id(chain), *((len(e), e.seen, e.base, e.tool) for e in sets))
+        alike.setdefault(kind, []).append(number)
+    found: dict[int, Trial] = {}
+    for numbers in alike.values():
+        chain, sets = tried[numbers[0]]
+        most = max(1, 4 * BLOCK // max(map(len, sets)))
+        for first in range(0, len(numbers), most):
+            some = numbers[first : first + most]
+            found |= zip(some, _at_once(chain, [tried[k][1] for k in some]), strict=True)
+    return [found[number] for number in range(len(tried))]
+
+
+def _at_once(chain: Chain, samples: Sequence[Sets]) -> Iterator[Trial]:
+    """Yield the trials of a chain with each of the samples: C times as many of one kind."""
+    placed, spreads, seen = chain, list[FloatArray](), list[tuple[Observations, FloatArray]]()
+    for every in zip(*samples, strict=True):
+        one = every[0]
+        names = ('joints', 'positions', 'rotations', 'oriented', *('points',) * one.seen)
+        each = one.changed(**{name: np.array([getattr(e, name) for e in every]) for name in names})
+        arm = flange(chain, each)
+        known = placed.all_frames  # other robots have only a base and a tool
+        alone = replace(chain, base=known.get(one.base), tool=known.get(one.tool))
+        alone = _nearest(alone, each.changed(base='base', tool='tool'), arm)
+        placed = placed.with_frame(one.base, alone.frame('base'))
+        placed = placed.with_frame(one.tool, alone.frame('tool'))
+        places = arm[..., :3, 3], each.positions
+        measured = places[: 1 if one.socket or one.seen else 2]  # a socket measures nothing
+        spreads.append(np.min([np.sqrt(e.var(axis=1).sum(axis=1)) for e in measured], axis=0))
+        seen.append((each, arm))
+    errors = _usual(np.concatenate([sample_errors(placed, *each) for each in seen], axis=1))
+    spread = np.median(spreads, axis=0)
+    frames = {name: placed.frame(name) for each, _ in seen for name in (each.base, each.tool)}
+    for k, sets in enumerate(samples):
+        for name, frame in frames.items():
+            chain = chain.with_frame(name, replace(frame, matrix=frame.matrix[k]))
+        trial = Trial(chain, sets, tuple(arm[k] for _, arm in seen), float(spread[k]))
+        vars(trial)['error'] = float(errors[k])
+        yield trial
+
+
+def _nearest(chain: Chain, each: Observations, arm: FloatArray) -> Chain:
+    """Return the chain in the closed forms (C, 4, 4) nearest to samples (C, N).
+
+    `arm` (C, N, 4, 4) are the poses of the bare arm.
+    """
+    best, away = _best_of([*closed_forms(chain, each, arm)], each, arm)
+    usual = _last(away) + 1
+    if usual < 2 * IN_A_FRAME:  # base and tool explain as few
+        return best
+    rows = np.arange(len(arm))[:, np.newaxis], np.argsort(away, axis=1)[:, :usual]
+    names = ('positions', 'rotations', 'oriented', *('points',) * each.seen)
+    few = each.changed(**{name: getattr(each, name)[rows] for name in names})
+    # a gross error would hide a mistake
+    return _best_of([best, *closed_forms(chain, few, arm[rows])], each, arm)[0]
+
+
+def _best_of(
+    starts: Sequence[Chain], each: Observations, arm: FloatArray
+) -> tuple[Chain, FloatArray]:
+    """Return the frames (C, 4, 4) that are best for C samples, as a chain, and errors (C, N)."""
+    sizes = np.array([sample_errors(start, each, arm) for start in starts])
+    best, found = (_usual(sizes).argmin(axis=0), np.arange(len(arm))), starts[0]
+    for end in ('base', 'tool'):
+        every = [np.broadcast_to(one.frame(end).matrix, (len(arm), 4, 4)) for one in starts]
+        found = found.with_frame(end, replace(found.frame(end), matrix=np.array(every)[best]))
+    return found, sizes[best]
+
+
+def _last(sizes: FloatArray) -> int:
+    """Return the place in order of the last of a usual share of sizes (..., N)."""
+    return int((1.0 - MOST_OUTLIERS) * (sizes.shape[-1] - 1))
+
+
+def _usual(sizes: FloatArray) -> FloatArray:
+    """Return the sizes (...,) that a usual share of (..., N) is within; np.quantile is slow."""
+    last = _last(sizes)
+    return np.asarray(np.partition(sizes, last)[..., last])
 
 
 def as_poses(problem: Problem, each: Observations) -> Observations:
@@ -163,12 +226,6 @@ def set_in_words(sets: Sequence[Observations], one: Observations) -> str:
     return f'in the measurements {which} alone, '
 
 
-def _nearest(chain: Chain, each: Observations, arm: FloatArray, rows: Flags) -> Trial:
-    """Return the best closed form of some rows (N,), judged by all of them."""
-    starts = closed_forms(chain, each.select(rows), arm[rows])
-    return min((Trial(s, (each,), (arm,)) for s in starts), key=lambda one: one.error)
-
-
 def refine_trial(problem: Problem, trial: Trial) -> Trial:
     """Return the trial with frames refined by least squares on the samples near it."""
     chain, sets = trial.chain, trial.sets
@@ -186,13 +243,18 @@ def refine_trial(problem: Problem, trial: Trial) -> Trial:
 
 
 def sample_errors(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
-    """Return the errors (N,) [m] of samples, given the poses (N, 4, 4) of the bare arm."""
-    found = chain.frame(each.base).matrix @ arm @ chain.frame(each.tool).matrix
-    left = each.positions - found[:, :3, 3]
-    if each.seen:
-        left = left - np.einsum('nij,nj->ni', found[:, :3, :3], each.given)
-    away = np.linalg.norm(left, axis=1)
+    """Return the errors (..., N) [m] of samples, given poses (..., N, 4, 4) of the bare arm."""
+    base, tool = chain.frame(each.base).matrix, chain.frame(each.tool).matrix
+    found = (arm.reshape(*arm.shape[:-3], -1, 4) @ tool).reshape(arm.shape)
+    places = found[..., :3, 3]
+    if each.points is not None:  # seen
+        places = places + np.einsum('...nij,...nj->...ni', found[..., :3, :3], each.points)
+    turn = base[..., :3, :3]
+    left = each.positions - places @ np.swapaxes(turn, -1, -2) - base[..., np.newaxis, :3, 3]
+    away = np.sqrt(np.einsum('...nj,...nj->...n', left, left))
     if each.oriented.any():
-        turns = se3.angles_between(found[:, :3, :3], each.rotations)
-        away = away + LEVER * np.where(each.oriented, turns, 0.0)
+        seen = np.swapaxes(each.rotations, -1, -2)
+        back = (seen.reshape(*seen.shape[:-3], -1, 3) @ turn).reshape(found[..., :3, :3].shape)
+        turned = se3.angles_between(back, np.swapaxes(found[..., :3, :3], -1, -2))
+        away = away + LEVER * np.where(each.oriented, turned, 0.0)
     return np.asarray(away)

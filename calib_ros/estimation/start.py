@@ -170,9 +170,11 @@ def _starts(chain: Chain, observations: Observations) -> Iterator[Iterator[Chain
 
 
 def flange(chain: Chain, observations: Observations) -> FloatArray:
-    """Return the poses (N, 4, 4) of the bare arm."""
-    arm = replace(chain, base=Frame(), tool=Frame())
-    return arm.forward(observations.joints, observations.approach)
+    """Return the poses (..., N, 4, 4) of the bare arm, at joint values (..., N, n)."""
+    arm, q, signs = replace(chain, base=Frame(), tool=Frame()), observations.joints, None
+    if observations.approach is not None:
+        signs = np.broadcast_to(observations.approach, q.shape).reshape(-1, q.shape[-1])
+    return arm.forward(q.reshape(-1, q.shape[-1]), signs).reshape(*q.shape[:-1], 4, 4)
 
 
 def free_in(chain: Chain, frames: Iterable[str]) -> list[Parameter]:
@@ -207,7 +209,8 @@ def closed_forms(
 ) -> Iterator[Chain]:
     """Yield the chain with base and tool for poses, positions or a socket, in closed form.
 
-    `arm` (N, 4, 4) are the poses of the bare arm, if known.
+    `arm` (..., N, 4, 4) are the poses of the bare arm, if known. Of measurements stacked as
+    (..., N, 3) each has its own frames (..., 4, 4).
     """
     arm = flange(chain, observations) if arm is None else arm
     for rotation in _closed_form(chain, arm, observations):
@@ -264,91 +267,116 @@ def _trilaterated(chain: Chain, arm: FloatArray, observations: Observations) -> 
 def _closed_form(
     chain: Chain, arm: FloatArray, observations: Observations
 ) -> Iterator[FloatArray]:
-    """Yield rotations of the base (3, 3) from the given frames and closed forms."""
+    """Yield rotations of the base (..., 3, 3) from the given frames and closed forms."""
     if observations.socket or (observations.seen and chain.base is None):
         yield np.eye(3)  # the world's axes are the base's
         return
     if chain.base is not None:
-        yield chain.base.matrix[:3, :3]
+        yield chain.base.matrix[..., :3, :3]
         if chain.base.fixed or observations.seen:
             return
-    oriented = observations.oriented
-    if oriented.any():
-        rotations, measured = arm[oriented, :3, :3], observations.rotations[oriented]
+    if observations.oriented.any():
+        products = _products(arm, observations)
         if chain.tool is not None:
-            tool = chain.tool.matrix[:3, :3]
-            yield se3.nearest_rotation(
-                np.einsum('nij,nkj->ik', measured, rotations @ tool) / len(measured)
-            )
-        system = np.einsum('nji,nlk->ikjl', rotations, measured).reshape(9, 9)
-        matrix = np.linalg.svd(system)[2][0].reshape(3, 3, order='F')
+            tool = chain.tool.matrix[..., :3, :3]
+            yield se3.nearest_rotation(np.einsum('...kmij,...mj->...ik', products, tool))
+        system = np.einsum('...jilk->...ikjl', products).reshape(*arm.shape[:-3], 9, 9)
+        matrix = np.linalg.svd(system)[2][..., 0, :].reshape(*arm.shape[:-3], 3, 3)
         sign = np.sign(np.linalg.det(matrix))  # arbitrary in a singular vector
-        yield se3.nearest_rotation(sign * matrix)
-    positions = observations.positions - observations.positions.mean(axis=0)
-    reached = (arm @ chain.frame('tool').matrix)[:, :3, 3]
-    yield se3.nearest_rotation(positions.T @ (reached - reached.mean(axis=0)))
-    if len(arm) >= 16 and chain.tool is None:
-        columns = np.concatenate([arm[:, :3, :3].reshape(-1, 9), arm[:, :3, 3]], axis=1)
-        solution = np.linalg.lstsq(columns - columns.mean(axis=0), positions, rcond=1e-9)[0]
-        yield se3.nearest_rotation(solution[9:].T)
+        yield se3.nearest_rotation(np.swapaxes(sign[..., np.newaxis, np.newaxis] * matrix, -1, -2))
+    positions = _centred(observations.positions)
+    reached = arm[..., :3, 3] + _applied(arm[..., :3, :3], chain.frame('tool').matrix[..., :3, 3])
+    yield se3.nearest_rotation(np.swapaxes(positions, -1, -2) @ _centred(reached))
+    if arm.shape[-3] >= 16 and chain.tool is None:
+        turns = arm[..., :3, :3].reshape(*arm.shape[:-2], 9)
+        columns = _centred(np.concatenate([turns, arm[..., :3, 3]], axis=-1))
+        solution = np.linalg.pinv(columns, rcond=1e-9) @ positions
+        yield se3.nearest_rotation(np.swapaxes(solution[..., 9:, :], -1, -2))
+
+
+def _products(arm: FloatArray, observations: Observations) -> FloatArray:
+    """Return the products (..., 3, 3, 3, 3) of arm's and measured rotations, over all poses."""
+    shape = arm.shape[:-3]
+    measured = observations.rotations * observations.oriented[..., np.newaxis, np.newaxis]
+    turns = np.swapaxes(arm[..., :3, :3].reshape(*shape, -1, 9), -1, -2)
+    return (turns @ measured.reshape(*shape, -1, 9)).reshape(*shape, 3, 3, 3, 3)
+
+
+def _applied(turns: FloatArray, vector: FloatArray) -> FloatArray:
+    """Return a vector (..., 3) turned by rotations (..., N, 3, 3)."""
+    flat = turns.reshape(*turns.shape[:-3], -1, 3) @ vector[..., np.newaxis]
+    return np.asarray(flat.reshape(*flat.shape[:-2], -1, 3))
+
+
+def _centred(values: FloatArray) -> FloatArray:
+    """Return values (..., N, c) less their mean."""
+    return np.asarray(values - values.mean(axis=-2, keepdims=True))
 
 
 def _complete(
     chain: Chain, arm: FloatArray, observations: Observations, rotation: FloatArray
 ) -> Chain:
-    """Return the chain with the rest of its frames in closed form, for a base rotation."""
+    """Return the chain with the rest of its frames in closed form, for base rotations."""
     base, tool = chain.frame('base'), chain.frame('tool')
-    base_matrix, tool_matrix = base.matrix.copy(), tool.matrix.copy()
-    oriented = observations.oriented
+    shape = (*arm.shape[:-3], 4, 4)
+    base_matrix, tool_matrix = (np.broadcast_to(f.matrix, shape).copy() for f in (base, tool))
     if not base.fixed:
-        base_matrix[:3, :3] = rotation
-    if not tool.fixed and oriented.any():
-        turned = rotation @ arm[oriented, :3, :3]
-        tool_matrix[:3, :3] = se3.nearest_rotation(
-            np.einsum('nji,njk->ik', turned, observations.rotations[oriented])
+        base_matrix[..., :3, :3] = rotation
+    if not tool.fixed and observations.oriented.any():
+        products = _products(arm, observations)
+        tool_matrix[..., :3, :3] = se3.nearest_rotation(
+            np.einsum('...jm,...mijk->...ik', rotation, products)
         )
-    # p = R_B p_K + R_B R_K t + b, with b and t unknown unless their frame is fixed
-    turned = rotation @ arm[:, :3, :3]
-    wanted = observations.positions - arm[:, :3, 3] @ rotation.T
-    if observations.seen:
+    # R_B^T p = p_K + R_K t + R_B^T b, with b and t unknown unless their frame is fixed
+    turns = arm[..., :3, :3]
+    wanted = observations.positions @ rotation - arm[..., :3, 3]
+    known = base_matrix[..., np.newaxis, :3, 3] @ rotation * base.fixed
+    if observations.points is not None:  # seen
         if not tool.fixed:
-            left = wanted - base_matrix[:3, 3] * base.fixed
-            tool_matrix[:3, :3] = _camera_rotation(turned, observations, left, not base.fixed)
-        wanted -= np.einsum('nij,nj->ni', turned @ tool_matrix[:3, :3], observations.given)
-    wanted -= turned @ tool_matrix[:3, 3]
+            left = wanted - known
+            found = _camera_rotation(turns, observations.points, left, not base.fixed)
+            tool_matrix[..., :3, :3] = found
+        places = observations.points @ np.swapaxes(tool_matrix[..., :3, :3], -1, -2)
+        wanted -= np.einsum('...nij,...nj->...ni', turns, places)
+    wanted -= _applied(turns, tool_matrix[..., :3, 3])
     if not tool.fixed:
-        left = wanted - base_matrix[:3, 3] if base.fixed else wanted
-        shift = _shortest(turned, left, not base.fixed)
-        tool_matrix[:3, 3] += shift
-        wanted -= turned @ shift
-    base_matrix[:3, 3] = wanted.mean(axis=0)
+        shift = _shortest(turns, wanted - known, not base.fixed)
+        tool_matrix[..., :3, 3] += shift
+        wanted -= _applied(turns, shift)
+    base_matrix[..., :3, 3] = np.einsum('...ij,...j->...i', rotation, wanted.mean(axis=-2))
     return _placed(chain, base_matrix, tool_matrix)
 
 
 def _camera_rotation(
-    turned: FloatArray, observations: Observations, wanted: FloatArray, free: bool
+    turned: FloatArray, given: FloatArray, wanted: FloatArray, free: bool
 ) -> FloatArray:
-    """Return the rotation (3, 3) of a camera that sees one point, at flange rotations (N, 3, 3).
+    """Return the rotation (..., 3, 3) of a camera that sees one point, `given` (..., N, 3).
 
-    R_i (R m_i + t) + b = wanted (N, 3) is linear in R, t and, if `free`, b.
+    At flange rotations (..., N, 3, 3): R_i (R m_i + t) + b = wanted (..., N, 3) is linear in R, t
+    and, if `free`, b.
     """
-    columns = [
-        np.einsum('nij,nk->nijk', turned, observations.given).reshape(-1, 9),
-        turned.reshape(-1, 3),
-    ]
-    columns += [np.tile(np.eye(3), (len(turned), 1))] * free
-    found = np.linalg.lstsq(np.concatenate(columns, axis=1), wanted.ravel(), rcond=1e-9)[0]
-    return se3.nearest_rotation(found[:9].reshape(3, 3))
+    shape = turned.shape[:-1]
+    parts = [np.einsum('...nij,...nk->...nijk', turned, given).reshape(*shape, 9), turned]
+    parts += [np.broadcast_to(np.eye(3), turned.shape)] * free
+    columns = np.concatenate(parts, axis=-1)
+    columns = columns.reshape(*shape[:-2], -1, columns.shape[-1])
+    flat = wanted.reshape(*shape[:-2], -1, 1)
+    found = (np.linalg.pinv(columns, rcond=1e-9) @ flat)[..., :9, 0]
+    return se3.nearest_rotation(found.reshape(*shape[:-2], 3, 3))
 
 
 def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:
-    """Return the shortest t (3,) [m] that brings R_i t + b close to wanted (N, 3) [m].
+    """Return the shortest t (..., 3) [m] that brings R_i t + b close to wanted (..., N, 3) [m].
 
-    Zero in directions in which rotations (N, 3, 3) vary little: well before a fit could take the
-    frame for degenerate and leave it where noise put it. b is arbitrary if `free`, else zero.
+    Zero in directions in which rotations (..., N, 3, 3) vary little: well before a fit could take
+    the frame for degenerate and leave it where noise put it. b is arbitrary if `free`, else zero.
     """
     if free:
-        turned, wanted = turned - turned.mean(axis=0), wanted - wanted.mean(axis=0)
-    left, sizes, right = np.linalg.svd(turned.reshape(-1, 3), full_matrices=False)
-    known = sizes > DEGENERATE / EXCEPTION * np.sqrt(len(turned))
-    return np.asarray(right[known].T @ ((wanted.ravel() @ left)[known] / sizes[known]))
+        turned, wanted = turned - turned.mean(axis=-3, keepdims=True), _centred(wanted)
+    flat = turned.reshape(*turned.shape[:-3], -1, 3)
+    across = np.swapaxes(flat, -1, -2)
+    squares, axes = np.linalg.eigh(across @ flat)
+    along = np.swapaxes(axes, -1, -2) @ (across @ wanted.reshape(*flat.shape[:-1], 1))
+    known = squares > (DEGENERATE / EXCEPTION) ** 2 * turned.shape[-3]
+    along[..., 0] *= known / np.where(known, squares, 1.0)
+    return np.asarray((axes @ along)[..., 0])

@@ -101,8 +101,8 @@ def to_euler(rotation: FloatArray, order: str) -> FloatArray:
 
 
 def angles_between(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the angles (N,) [rad] between rotations (N, 3, 3), to 1e-8."""
-    cosines = (np.einsum('nij,nij->n', first, second) - 1.0) / 2.0
+    """Return the angles (...,) [rad] between rotations (..., 3, 3), to 1e-8."""
+    cosines = (np.einsum('...ij,...ij->...', first, second) - 1.0) / 2.0
     return np.asarray(np.arccos(np.clip(cosines, -1.0, 1.0)))
 
 

@@ -139,9 +139,9 @@ def searched(monkeypatch):
     """Return a function that sets the suspects, and the share of errors that some leave."""
 
     def search(options, shares, pairs=()):
-        def trial_of(chain, sets):
-            share = shares.get(''.join(sorted(sets[0])), 1.0)
-            return SimpleNamespace(share=share, error=share)
+        def trials_of(tried):
+            found = [shares.get(''.join(sorted(sets[0])), 1.0) for _, sets in tried]
+            return [SimpleNamespace(share=share, error=share) for share in found]
 
         suspects = [
             Suspect(
@@ -158,7 +158,7 @@ def searched(monkeypatch):
         monkeypatch.setattr(mistakes, 'suspects', lambda *_: suspects)
         monkeypatch.setattr(mistakes.orders, 'in_any_order', lambda *_: ())
         monkeypatch.setattr(mistakes, 'hidden', lambda chain, others: hidden)
-        monkeypatch.setattr(mistakes, 'trial_of', trial_of)
+        monkeypatch.setattr(mistakes, 'trials_of', trials_of)
         monkeypatch.setattr(mistakes, 'refine_trial', lambda problem, trial: trial)
 
     return search

@@ -20,6 +20,7 @@ from calib_ros.decision.trials import (
     sample_errors,
     set_in_words,
     trial_of,
+    trials_of,
 )
 from calib_ros.estimation.start import flange
 
@@ -43,6 +44,20 @@ def test_gross_errors_do_not_spoil_the_closed_form(count, found):
     assert trial.chain.all_frames.keys() >= {'base_B', 'tool_B'}
     assert trial.spread == pytest.approx(min(spreads))
     assert trial.share == trial.error / trial.spread
+
+
+def test_trials_at_once_are_those_one_by_one():
+    """Of as many samples of one kind; other arms, counts and kinds are computed apart."""
+    chain, seen = with_gross_errors(24, 6)
+    placed = replace(seen, oriented=np.zeros(24, dtype=bool))
+    kinds = (seen, placed.inverted(), seen.select(np.arange(4, 22)), replace(seen, tool='tool_B'))
+    turned = [replace(each, joints=each.joints + 0.1 * k) for k in range(3) for each in kinds]
+    cases = [(chain, (turned[k], turned[k - 1])) for k in range(0, 12, 2)]
+    cases += [(arm, (each,)) for arm in (chain, UR10E) for each in turned]
+    for (arm, sets), found in zip(cases, trials_of(cases), strict=True):
+        alone = trial_of(arm, sets)
+        assert (found.error, found.share) == pytest.approx((alone.error, alone.share), rel=1e-9)
+        assert Trial(found.chain, sets, found.arms).error == pytest.approx(found.error, rel=1e-9)
 
 
 def test_a_mistake_that_spares_half_of_the_samples_is_not_small():
