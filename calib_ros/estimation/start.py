@@ -40,7 +40,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray, norms
+from calib_ros.kinematics.se3 import ROUNDS, FloatArray, norms
 from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.shown import counted
 
@@ -148,7 +148,8 @@ def _start_one(
             if np.median(away) <= EXCEPTION * spread:  # the same valley
                 continue
             chosen = excited(factor_of(start, names, system), names)
-            fitted = minimise(start, chosen, system, tolerance=1e-3).chain
+            # the robust fit goes on from the best
+            fitted = minimise(start, chosen, system, 1e-3, ROUNDS // 4).chain
             residual = residual_arrays(fitted, subset)[0]
             error = np.median(norms(residual))  # robust
             if error < least:
