@@ -33,7 +33,6 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.effects import coupled
-from calib_ros.kinematics.joint import Frame
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray, Index
 
@@ -47,8 +46,8 @@ def by_both_arms(
     """Return the residuals, and their RMS [m] over configurations without a common motion.
 
     The latter is infinite for pixels, which have no positions. And whether all were measured at
-    the `commanded` joint values (M, n), not at corrected ones, and the arm in the frame of its
-    base.
+    the `commanded` joint values (M, n), not at corrected ones, and the calibrated arm in fitted
+    frames.
     """
     before, after = arm.before, arm.chain
     wanted, uncorrected = sets, False
@@ -65,8 +64,7 @@ def by_both_arms(
     if all(each.pixels is None for each in sets):
         shaped = compare(before, _rebased(after, wanted), wanted).after
         left = rms_of(moments_of(shaped.position, pair.before.configurations), IN_A_FRAME // 3)
-    own = ((name, Frame() if name[:4] == 'base' else each) for name, each in after.frames)
-    chain = replace(arm.chain, base=Frame(), tool=after.tool, frames=tuple(own))
+    chain = replace(arm.chain, base=after.base, tool=after.tool, frames=after.frames)
     return along_base(pair, after, sets), left, uncorrected, chain
 
 

@@ -9,8 +9,8 @@ With the wanted RMS error as limit, and the interval of `confidence.py`, it is
     UNDECIDED   the limit lies in the interval: more poses are needed
 
 Of a device with more noise than that of the calibration, the excess is no error of the arm: it
-does not hold only if the interval without it is beyond the limit. Noise that nobody states is at
-most what a fit of all parameters, frames and effects leaves: it would follow a change.
+does not hold only if the interval without it is beyond the limit. Noise that nobody states is
+that of `device_noise.py`.
 """
 
 from __future__ import annotations
@@ -20,30 +20,24 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy import special
 
 from calib_ros.apply.confidence import limits_of, moments_of
+from calib_ros.apply.device_noise import noise_seen, unstated
 from calib_ros.decision import mistakes
 from calib_ros.decision.comparison import Comparison, along_base, compare
 from calib_ros.decision.diagnosis import Diagnosis
-from calib_ros.decision.steps import find_step
 from calib_ros.decision.trials import position_fault_limit
-from calib_ros.errors import MOST_ENTRIES, InputError
-from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.levels import CLEARLY, CONFIDENT, TELLING
+from calib_ros.errors import MOST_ENTRIES
+from calib_ros.estimation.levels import CLEARLY, CONFIDENT
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.start import reframed
-from calib_ros.estimation.uncertainty import covariance
 from calib_ros.identification.calibration import Calibration
-from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import Index
 from calib_ros.shown import rounded
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
 STANDS: dict[Verdict, Verdict] = {'PASS': 'holds', 'FAIL': 'does not hold'}
-WORN = ('ratio', 'coupling', 'eccentricity', 'gravity')
-"""Effects that a repair, wear or another load change."""
 DECIDING = 10 * MOST_ENTRIES  # largest number of configurations reported as deciding
 
 
@@ -80,6 +74,8 @@ class Judgement:
     """What explains measurements that are further off than any arm."""
     noise: float
     """RMS [m] of the noise of a noisier device beyond the former error; 0 if not decisive."""
+    unstated: bool
+    """Whether nobody stated the noise of some measurements."""
     near: tuple[str, ...]
     """Joints that move clearly less than in the calibration, of one that holds."""
 
@@ -122,13 +118,15 @@ def judge(
     lost: int = 0,
     of_messages: bool = False,
     sigma_position: float | None = None,
+    chain: Chain | None = None,
 ) -> Judgement:
     """Judge a calibrated arm by its errors at new measurements, in its frames if not given.
 
     Each configuration counts once, however often it was measured; fitted frames have absorbed the
     errors of `lost` ones. Without a `tolerance` [m] the limit is that of the calibration. Remedies
     of a mistake are those of messages or of tables. `sigma_position` [m] is the noise of positions
-    without a covariance; None that of the earlier device, or more if the errors show it.
+    without a covariance; None that of the earlier device, or more if the errors show it. `chain`
+    is the calibrated arm in refitted frames.
     """
     found = found or along_base(compare(arm.before, arm.chain, sets), arm.chain, sets)
     moments = moments_of(found.after.position, found.before.configurations)
@@ -137,14 +135,15 @@ def judge(
     mistake = _mistake(arm, sets, rms, angle, of_messages)
     reused, limit = arm.reused(sets), tolerance or arm.limit(sets, found.figures[0].rms_mm)
     beyond = limit is not None and not tolerance and lower[0] > limit
-    noise = _noise_beyond(arm, sets, sigma_position) if beyond else 0.0
+    guessed = unstated(sets) if sigma_position is None else []
+    given = sigma_position, chain or arm.chain, guessed
+    noise = _noise_beyond(arm, sets, *given) if beyond else 0.0
     least = np.sqrt(np.maximum(lower**2 - noise, 0.0))
     verdict: Verdict = 'no verdict'
     if limit is not None and not mistake:
         verdict = compared(limit, least[0], upper[0])
         decided = numbers[(upper <= limit) | (least > limit)]
         noise *= verdict != compared(limit, lower[0], upper[0])
-        guessed = sigma_position is None and any(each.covariance is None for each in sets)
         decided = decided[:0] if noise and guessed else decided  # its own error is not known
     if reused and verdict != 'FAIL':
         verdict = 'no verdict'
@@ -162,42 +161,31 @@ def judge(
         reused=reused,
         mistake=mistake,
         noise=float(np.sqrt(noise)),
+        unstated=bool(guessed),
         near=_near(arm, sets) if verdict == 'holds' else (),
     )
 
 
-def _noise_beyond(arm: Calibration, sets: Sequence[Observations], stated: float | None) -> float:
+def _noise_beyond(
+    arm: Calibration,
+    sets: Sequence[Observations],
+    stated: float | None,
+    chain: Chain,
+    guessed: Sequence[Observations],
+) -> float:
     """Return by how much the mean square noise [m^2] exceeds the former noise and error."""
     if arm.noise is None or arm.residual is None or any(s.pixels is not None for s in sets):
         return 0.0
     problem = Problem(arm.before, sets[0], more=sets[1:])  # the earlier device
     then = now = arm.noise.expected_in(problem).sigma_position
-    if stated is None:
-        now = max(now, _noise_left(arm, sets))
-    else:
+    if guessed:
+        now = max(now, noise_seen(chain, guessed))
+    elif stated is not None:
         problem = replace(problem, sigma_position=stated)
         now = arm.noise.expected_in(problem, ('sigma_position',)).sigma_position
     found = np.concatenate([each.covariances((now, 1.0))[:, :3, :3] for each in sets])
     former = max(3.0 * then**2, arm.residual**2)
     return max(0.0, float(np.trace(found.mean(axis=0))) - former)
-
-
-def _noise_left(arm: Calibration, sets: Sequence[Observations]) -> float:
-    """Return the noise [m] that no change, nor one amidst the poses, explains; 0 of few poses."""
-    chain = reframed(arm.chain, arm.chain.frame_names, fixed=False)
-    worn = [name for group in WORN for name in effects.members(chain, group)]
-    try:
-        fitted = fit(problem := Problem(chain, sets[0], more=sets[1:], effects=worn))
-    except (InputError, np.linalg.LinAlgError):
-        return 0.0
-    taken = float(np.sum(covariance(fitted.factor) * fitted.robust.fit.normal.parts[0]))
-    count, step = 3 * sum(map(len, sets)), find_step(fitted)
-    # one that the arm imitates leaves nothing, unless priors hold the arm back
-    moved = step is not None and (step.share < 1.0 or count < len(fitted.names))
-    if (free := count - taken) < TELLING or moved:
-        return 0.0
-    likely = fitted.noise.position * np.sqrt(free / special.chdtri(free, CONFIDENT))
-    return float(likely * problem.sigma_position)
 
 
 def _near(arm: Calibration, sets: Sequence[Observations]) -> tuple[str, ...]:

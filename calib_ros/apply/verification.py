@@ -8,6 +8,7 @@ Errors are those of `both_arms.py`, and the verdict that of `judgement.py`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import Observations, frames_of_sets
 from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.calibration import Calibration
+from calib_ros.kinematics.joint import Frame
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
 
@@ -67,13 +69,14 @@ def verify(
         of_frames = f', {lost} of them for the refitted frames' if lost else ''
         raise InputError(f'{count} {were} measured; at least {more} are needed{of_frames}')
     given = comparison, tolerance, confidence, lost
-    found = judge(arm, sets, *given, sigma_position=sigma_position)
+    found = judge(arm, sets, *given, sigma_position=sigma_position, chain=chain)
+    own = ((name, Frame() if name[:4] == 'base' else each) for name, each in chain.frames)
     return Verification(
         **vars(found),
         tolerance=tolerance,
         common=1.0 if new_base or np.isinf(left) else left / found.rms,
         by_program=commanded is not None,
-        chain=chain,
+        chain=replace(chain, base=Frame(), frames=tuple(own)),
         fitted=fitted,
         outside=arm.outside(sets),
         uncorrected=uncorrected,
@@ -113,6 +116,8 @@ def _check(arm: Calibration, sets: Sequence[Observations], fitted: tuple[str, ..
     chain = arm.chain
     if not sets:
         raise ConfigError('sets must hold at least one set of Observations')
+    if not any(map(len, sets)):
+        raise InputError('no pose was measured')
     if any(each.distances is not None or each.socket for each in sets):
         raise InputError(
             'verification needs measured poses or positions: leave out rows of distances, planes '

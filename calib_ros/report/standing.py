@@ -58,7 +58,10 @@ NOISY = (
         'If it is as accurate, check for play in the joints and a loose target.',
     ),
 )
-UNSAID = 'If the device has more noise than that of the calibration, state it (--sigma-position).'
+UNSAID = (
+    'State the noise of the device (--sigma-position), or, with few poses, measure more: 30 tell '
+    'noise from a change.'
+)
 REUSED = (
     Headline('open', 'No verdict: the calibration was computed from these measurements'),
     (f'Measure new poses, {SPREAD_OUT}, and verify with those alone.',),
@@ -83,9 +86,7 @@ def standing(found: Verification) -> tuple[Headline, tuple[str, ...]]:
     if found.verdict == 'UNDECIDED' and found.needed is None and not found.outside:
         state, steps = NOISY if found.noise else AT_THE_LIMIT
         steps = (sentence(found.overstated),) if found.overstated else steps
-    few = 3 * found.comparison.figures[1].count < len(found.chain.parameter_names)
-    if few and found.verdict == 'does not hold':  # their fit leaves no noise to see
-        steps = (UNSAID, *steps)
+        steps = (UNSAID, *steps) if found.noise and found.unstated else steps
     if not found.by_program:  # nor whether the correction reaches the arm
         state = replace(state, heading=state.heading.replace('the arm', 'the calibration'))
         steps = tuple(each for each in steps if each != ACTIVE)

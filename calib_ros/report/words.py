@@ -173,8 +173,11 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
 def still_holds(updated: Recalibration, found: Judgement) -> tuple[bool, str]:
     """Return whether a calibration holds at the last stops, and why."""
     text = f'RMS {rounded(1e3 * found.rms)} mm at the last {counted(found.configurations, "pose")}'
-    if found.mistake:
+    doubted = not (updated.step or updated.explained)  # noise that nobody stated, perhaps
+    if found.mistake or (doubted and found.unstated and found.noise):
         return False, verdict_in_words(found)
+    if doubted and found.verdict == 'holds':
+        return True, verdict_in_words(found)
     if updated.step or updated.changed:  # poses before and after a step look like many changes
         reasons = updated.step or changes_in_words(updated.changed)
         if not (updated.step or updated.explained):
