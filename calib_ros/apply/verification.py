@@ -21,11 +21,12 @@ from calib_ros.apply.verified import Verification
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import CONFIDENT
-from calib_ros.estimation.observations import Observations, frames_of_sets
+from calib_ros.estimation.observations import SOME_POSES, Observations, frames_of_sets
 from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.calibration import Calibration
+from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.joint import Frame
-from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 
 NEEDED = 1 + len(TILTED)  # configurations without those for fitted frames: as in ISO 9283
@@ -82,7 +83,26 @@ def verify(
         uncorrected=uncorrected,
         odd=() if found.limit is None else _odd(found, found.limit, lost),
         step=arm.step(sets) if found.failed else None,
+        unseen=_unseen(arm, sets, found) if found.verdict in ('PASS', 'holds') else None,
     )
+
+
+def _unseen(arm: Calibration, sets: Sequence[Observations], found: Judgement) -> float:
+    """Return the largest error [m] by one parameter that fits the interval beside the usual error.
+
+    The parameter moves the target most somewhere in the joint range, and less at these poses.
+    """
+    chain = arm.chain
+    names = [name for name in chain.parameter_names if name.of_dh]
+    models = [ErrorModel(chain, names, each.base, each.tool) for each in sets]
+    pairs = zip(models, sets, strict=True)
+    seen = np.concatenate([model.jacobian(each.spread().joints)[:, :3] for model, each in pairs])
+    here = np.sqrt((seen**2).sum(axis=1).mean(axis=0))
+    joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
+    there = np.linalg.norm(models[0].jacobian(joints)[:, :3], axis=1).max(axis=0)
+    ratios = there / np.maximum(here, HALF_THE_DIGITS)
+    usual = min(arm.residual or 0.0, found.lower)
+    return float(ratios.max(initial=1.0) * np.sqrt(found.upper**2 - usual**2))
 
 
 def _odd(found: Judgement, limit: float, lost: int) -> tuple[int, ...]:

@@ -55,6 +55,8 @@ class Verification(Judgement, Shown):
     """Configurations without which the others would be within the limit."""
     step: Step | None = None
     """What moved during the measurement, if the arm exceeds the limit."""
+    unseen: float | None = None
+    """Largest error [m] in the joint range by one parameter that a good verdict leaves open."""
 
     def _repr_html_(self) -> str:
         before, after = self.comparison.figures

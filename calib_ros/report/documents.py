@@ -102,7 +102,7 @@ def configuration_yaml(chain: str, settings: Settings, **more: Any) -> str:
 
 def verification_document(found: Verification) -> dict[str, Any]:
     """Return a verdict and its figures as plain values."""
-    names = ('tolerance', 'limit', 'rms', 'lower', 'upper')  # the last three of poses like these
+    names = ('tolerance', 'limit', 'unseen', 'rms', 'lower', 'upper')  # last of poses like these
     lengths = {f'{name}_mm': getattr(found, name) for name in names}
     return {
         'verdict': found.verdict,

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import measured_arm
 from verified import NOISE, UR, measured
 
 from calib_ros.apply.judgement import judge
@@ -14,7 +15,12 @@ from calib_ros.cli.common import settings_of
 from calib_ros.cli.parser import parser_of
 from calib_ros.errors import InputError
 from calib_ros.estimation.problem import Problem
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibration import recalibrate
+from calib_ros.kinematics.se3 import norms
+from calib_ros.report.documents import verification_document
+from calib_ros.report.remarks import caveats
 from calib_ros.report.standing import standing
 from calib_ros.report.words import still_holds
 from calib_ros.settings import Settings
@@ -136,3 +142,21 @@ def test_noise_that_is_stated_larger_than_all_errors_is_told(cell, arm):
     update = recalibrate(arm, Problem(UR, seen, sigma_position=0.01, sigma_orientation=0.01), 0.0)
     holds, told = still_holds(update, judge(arm, [seen], sigma_position=0.01))
     assert (holds, 'contradicts the errors' in told) == (False, True)
+
+
+def test_the_error_that_a_good_verdict_leaves_open_is_told():
+    """A slip of 1 mrad hides beside 1 mm of noise."""
+    noise = (1e-3, 2e-3)
+    _, true, seen = measured_arm(7, 40, noise=noise)
+    sigmas = {'sigma_position': noise[0], 'sigma_orientation': noise[1]}
+    coarse = Calibration.of(identify(Problem(UR, seen, **sigmas)))
+    slipped = true.with_offsets({'shoulder_lift_joint.theta': 1e-3})
+    q = UR.random_joints(30, np.random.default_rng(3))
+    found = verify(coarse, [measured(slipped, q, 1, noise)], None)
+    joints = UR.random_joints(200, np.random.default_rng(0))
+    moved = norms((slipped.forward(joints) - true.forward(joints))[:, :3, 3]).max()
+    assert found.verdict == 'holds'
+    assert moved < found.unseen < 5.0 * moved
+    told = f'by up to {1e3 * found.unseen:.3f} mm (at its worst in the joint range) would not'
+    assert any(told in each for each in caveats(found))
+    assert verification_document(found)['unseen_mm'] == 1e3 * found.unseen
