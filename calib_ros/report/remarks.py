@@ -52,10 +52,10 @@ def caveats(found: Verification) -> list[str]:
             f'{100.0 * NEARER:g} % as far as for the calibration; for more, verify all over its '
             'range'
         )
-    if found.unseen is not None:
+    if found.unseen is not None and found.unseen > (found.limit or 0.0):
         lines.append(
-            f'an error of a single parameter by up to {rounded(1e3 * found.unseen)} mm (at its '
-            'worst in the joint range) would not have been seen'
+            'a change of one joint or link could go unseen here and move the target by up to '
+            f'{rounded(1e3 * found.unseen)} mm where it is worst'
         )
     turned = turned_in_words(found.comparison.figures[1])
     return [*lines, turned] if turned and found.common >= NEARER else lines
