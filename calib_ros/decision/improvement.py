@@ -100,7 +100,7 @@ def harm_refusals(validation: Comparison, may_be_rounding: bool, helps: bool) ->
                 f'{rounded(first.mean_mm)} and {rounded(second.mean_mm)} mm)',
             )
     if may_be_rounding:
-        text = 'the improvement may only come from rounded joint values that repeat in many poses'
+        text = 'rounded joint values that repeat in many poses may cause most of the correction'
         yield Reason(Rule.ROUNDING, text)
     before, after = validation.figures
     if after.rms_mrad is not None:

@@ -1,11 +1,8 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rounded joint values: does the arm explain the gain, or the rounding?
+"""Rounded joint values: what they add to errors, and whether they may be all that was corrected.
 
-docs/model.md (Judgement) gives the reasons. An F test decides whether the arm explains more of the
-nominal residuals y, frames projected out, than chance would if rounding explained them all,
-
-    y ~ N(0, k (I + C C^T))        C: a column for each value of each joint, scaled to its error
+docs/model.md (Judgement) gives the reasons.
 """
 
 from __future__ import annotations
@@ -13,15 +10,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from scipy import special
 
 from calib_ros.estimation.fitted import Fitted
-from calib_ros.estimation.gain import gain_of
-from calib_ros.estimation.levels import CLEARLY, SURE, chance_of
+from calib_ros.estimation.levels import CLEARLY, CONFIDENT
+from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.system import row_samples, stacked
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import TWO_TURNS
-from calib_ros.kinematics.parameter import Parameter
+from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.values import ROUNDED, SAME
 
@@ -35,14 +33,19 @@ RESOLUTIONS = (
 def rounded_joints(problem: Problem) -> dict[str, float]:
     """Return the joints whose values are multiples of a step [rad or m], with the step.
 
+    A few values may also be multiples of a wide one by chance: a step of other joints counts then.
     None if some are hardly rad or m: the steps are of another unit.
     """
     joints = np.concatenate([each.joints for each in problem.sets])
     if np.abs(joints).max() > TWO_TURNS:
         return {}
-    pairs = zip(problem.chain.joint_names, joints.T, strict=True)
-    steps = {name: resolution_of(q) for name, q in pairs}
-    return {name: step for name, step in steps.items() if step > 0.0}
+    own = {
+        name: resolution_of(q) for name, q in zip(problem.chain.joint_names, joints.T, strict=True)
+    }
+    for name, values in zip(own, joints.T, strict=True):
+        steps = {*own.values()} - {0.0} if np.ptp(values) and not own[name] else ()
+        own[name] = max([own[name], *(s for s in steps if _are_multiples(values, s))])
+    return {name: step for name, step in own.items() if step > 0.0}
 
 
 def resolution_in_words(step: float, unit: str) -> str:
@@ -68,14 +71,14 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
     return found
 
 
-def error_by_rounding(problem: Problem) -> float:
+def error_by_rounding(problem: Problem, coarse: Mapping[str, float]) -> float:
     """Return the RMS position error [m] of the flange that rounded joint values cause."""
-    joints, chain = np.concatenate([each.joints for each in problem.sets]), problem.chain
-    coarse, squares = rounded_joints(problem), 0.0
-    for number in np.flatnonzero([name in coarse for name in chain.joint_names]):
-        step = coarse[chain.joint_names[number]] * (np.arange(joints.shape[1]) == number)
-        moved = (chain.forward(joints + step) - chain.forward(joints))[:, :3, 3]
-        squares += float(np.mean(np.sum(moved**2, axis=-1))) / 12.0
+    joints, chain = np.concatenate([each.spread().joints for each in problem.sets]), problem.chain
+    squares = 0.0
+    for name, step in coarse.items():
+        moved = joints + step * (np.array(chain.joint_names) == name)
+        shift = (chain.forward(moved) - chain.forward(joints))[:, :3, 3]
+        squares += float(np.mean(np.sum(shift**2, axis=-1))) / 12.0
     return float(np.sqrt(squares))
 
 
@@ -94,37 +97,38 @@ def _are_multiples(values: FloatArray, step: float) -> bool:
     return bool(np.abs(values / step - np.round(values / step)).max() < ROUNDED)
 
 
-def may_be_rounding(fitted: Fitted, before: Chain, steps: Mapping[str, float]) -> bool:
-    """Tell whether rounding of joint values explains the nominal residuals as well.
+def may_be_rounding(fitted: Fitted, before: Chain, coarse: Mapping[str, float]) -> bool:
+    """Tell whether rounding moves the arm by half of the correction or more, over the joint range.
 
-    `before` is the nominal chain with fitted frames, `steps` belong to rounded joints.
+    A fit follows the rounding of values that repeat, and so do poses left out of it; what it can
+    not follow shows in the residuals. `before` is the nominal chain with fitted frames, `coarse`
+    holds the steps of rounded joint values.
     """
-    problem, names = fitted.problem, fitted.names
-    sets = fitted.good_sets()
-    joints = np.concatenate([each.joints for each in sets])
-    levels = {}
-    for number, joint in enumerate(problem.chain.joints):
-        value, level = np.unique(joints[:, number], return_inverse=True)
-        if joint.name in steps and 2 * len(value) <= len(joints):
-            levels[joint.driven] = level
-    arm = [name for name in names if not before.owns_frame(name)]
-    if not (levels and arm):
+    if not coarse:
         return False
-    frames = [name for name in names if before.owns_frame(name)]
-    chain = before.with_effects([name for name in arm if name in dict(problem.model.effects)])
-    wanted = list(dict.fromkeys([*frames, *arm, *levels]))
-    parts = problem.system(sets).rows_of(chain, wanted)
-    owner, rows = row_samples(parts), stacked(parts)
-    columns = [rows[:, : len(frames)]]
-    for name, level in levels.items():
-        size = steps[Parameter(name).owner] / np.sqrt(12.0)
-        column = size * rows[:, [wanted.index(name)]]
-        columns.append(column * (level[owner, np.newaxis] == np.unique(level)))
-    beside = np.column_stack(columns)
-    every = np.column_stack([beside, rows[:, len(frames) : len(frames) + len(arm)], rows[:, -1]])
-    prior, count = np.zeros(every.shape[1]), beside.shape[1]
-    prior[len(frames) : count] = 1.0
-    gain, rank, left = gain_of(every.T @ every + np.diag(prior), count)
-    freedom = max(len(rows) - len(frames) - rank, 1)
-    noise = max(left - gain, 1e-300) / freedom
-    return chance_of(gain / noise, rank, freedom) > 1.0 - SURE
+    chain, names = fitted.chain, fitted.names
+    sets = [each.spread() for each in fitted.good_sets()]
+    wanted = list(dict.fromkeys([*names, *(joint.driven for joint in chain.joints)]))
+    parts = fitted.problem.system(sets).rows_of(chain, wanted)
+    rows, owner = stacked(parts), row_samples(parts)
+    own = rows[:, : len(names)]
+    inverse = np.linalg.pinv(own.T @ own, hermitian=True)
+    followed, shown = np.zeros((len(names), len(names))), 0.0
+    values = np.concatenate([each.joints for each in sets]).T
+    for joint, q in zip(chain.joints, values, strict=True):
+        different, level = np.unique(q, return_inverse=True)
+        if joint.name in coarse and 2 * len(different) <= len(q):
+            column = rows[:, [wanted.index(joint.driven)]] * coarse[joint.name] / np.sqrt(12.0)
+            along = np.zeros((len(different), len(names)))
+            np.add.at(along, level[owner], own * column)
+            followed += along.T @ along
+            shown += float(np.sum(column**2) - np.sum(along @ inverse * along))
+    freedom = max(len(rows) - len(names), 1)
+    left = np.sum(rows[:, -1] ** 2) / special.chdtri(freedom, CONFIDENT) - 1.0  # at most
+    share = min(1.0, max(left, 0.0) * freedom / max(shown, 1e-300))
+    ends = sets[0].base, sets[0].tool
+    joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
+    moves = ErrorModel(chain, names, *ends).jacobian(joints)[:, :3]
+    moved = share * np.einsum('ncp,pq,ncq->', moves, inverse @ followed @ inverse, moves)
+    corrected = chain.forward(joints, None, *ends) - before.forward(joints, None, *ends)
+    return bool(4.0 * moved > np.sum(corrected[:, :3, 3] ** 2))

@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import special
 from test_steps import NOISE, SIGMAS, UR10E, arm, poses
 
 from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.decision import rounding
+from calib_ros.decision.reasons import Rule
 from calib_ros.decision.rounding import resolution_in_words, rounded_joints, rounding_errors
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.fitting import fit
@@ -19,6 +21,7 @@ from calib_ros.estimation.system import row_samples, stacked
 from calib_ros.identification import identification
 from calib_ros.identification.identification import identify
 from calib_ros.identification.model_choice import identify_model
+from calib_ros.kinematics.jacobian import ErrorModel
 
 pytestmark = pytest.mark.usefixtures('unsearched')
 
@@ -137,17 +140,19 @@ def test_what_rounding_gives_to_the_zero_of_a_joint(step, rng):
     """A value that most poses share hardly averages out."""
     q = UR10E.random_joints(40, rng)
     q[:, 1], q[:, 2] = step * rng.permutation(600)[:40], step * np.repeat([0, 1, 3], [20, 10, 10])
-    q[:, 3] = step * np.repeat([0, 1], 20)  # two values tell no step
+    q[:, 3] = step * np.repeat([0, 1], 20)  # two values tell no step, but may have that of others
+    q[:, 5] = 0.0
     problem = Problem(UR10E, measure(UR10E, q, rng))
     q[7, 4] = 45.0  # as in degrees
     assert rounded_joints(Problem(UR10E, measure(UR10E, q, rng))) == {}
     steps = rounded_joints(problem)
-    assert steps == {'shoulder_lift_joint': step, 'elbow_joint': step}
+    assert steps == {'shoulder_lift_joint': step, 'elbow_joint': step, 'wrist_1_joint': step}
     one = step / np.sqrt(12.0)
     assert rounding_errors(problem, steps) == pytest.approx(
         {
             'shoulder_lift_joint.theta': one / np.sqrt(40.0),
             'elbow_joint.theta': one * np.sqrt(0.5**2 + 2 * 0.25**2),
+            'wrist_1_joint.theta': one * np.sqrt(0.5),
         }
     )
 
@@ -169,33 +174,49 @@ def test_errors_that_rounding_gives_to_zeros_are_of_the_session(rng, monkeypatch
     assert found[1] > found[0] + 5e-4
 
 
-def test_whether_rounding_explains_the_gain_is_an_f_test(rng, monkeypatch):
-    """Of rows whitened by the noise and the error that poses of equal joint value share."""
-    told = []
-    monkeypatch.setattr(rounding, 'chance_of', lambda *given: told.append(given) or 0.0)
-    true, q = arm(rng), UR10E.random_joints(40, rng)
-    level = rng.integers(5, size=40)
+@pytest.mark.parametrize(('seed', 'errors'), [(10, 0.0), (31, 1.0), (33, 1.0)])
+def test_an_arm_is_not_bent_to_rounding_that_poses_share(seed, errors):
+    """With 10 mrad in a grid 8 of 40 were accepted, 6 of them worse.
+
+    Of the first one joint's three values are multiples of 50 mrad, too.
+    """
+    rng, step = np.random.default_rng(seed), 5e-3 if errors else 1e-2
+    true, levels = arm(rng, errors), rng.uniform(-2.0, 2.0, (6, 3))
+    q = levels[np.arange(6), rng.integers(3, size=(60, 6))]
+    rounded = step * np.round(q / step)
+    for moved in (q, rounded):  # the latter is recorded as it is
+        seen = measure(true, moved, rng, *NOISE, oriented=bool(seed % 2))
+        result = identify(Problem(UR10E, replace(seen, joints=rounded), **SIGMAS))
+        told = Rule.ROUNDING in {each.rule for each in result.refusals}
+        assert told == (moved is q or not errors)
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_how_far_rounding_moves_an_arm(seed, monkeypatch):
+    """By offsets drawn for each value and fitted by plain least squares."""
+    rng = np.random.default_rng(seed)
+    level = rng.integers(4, size=40)
+    q = UR10E.random_joints(40, rng)
     q[:, 2] = 0.3 * level
-    problem = Problem(UR10E, measure(true, q, rng, *NOISE), **SIGMAS)
-    before = replace(UR10E, base=true.base, tool=true.tool)
-    fitted = fit(problem)
-    rounding.may_be_rounding(fitted, before, {'elbow_joint': 1e-3})
-    frames = [name for name in fitted.names if before.owns_frame(name)]
-    assert not rounding.may_be_rounding(
-        replace(fitted, names=frames), before, {'elbow_joint': 1e-3}
-    )
-    own = [name for name in fitted.names if name not in frames]
-    parts = problem.system(problem.sets).rows_of(before, [*frames, *own])
-    rows, level = stacked(parts), level[row_samples(parts)]
-    shared = rows[:, [[*frames, *own].index('elbow_joint.theta')]] * 1e-3 / np.sqrt(12.0)
-    covariance = np.eye(len(rows)) + shared @ shared.T * (level == level[:, np.newaxis])
-    white = np.linalg.solve(np.linalg.cholesky(covariance), rows)
-    fewer, every = (
-        np.linalg.lstsq(white[:, :count], white[:, -1])[1][0] for count in (len(frames), -1)
-    )
-    freedom = len(rows) - len(fitted.names)
-    found = (fewer - every) / every * freedom
-    assert told == [(pytest.approx(found, rel=1e-5), len(own), freedom)]
+    seen = measure(arm(rng), q, rng, *NOISE)
+    fitted = fit(Problem(UR10E, seen, **SIGMAS))
+    before = replace(UR10E, base=fitted.chain.base, tool=fitted.chain.tool)
+    names, driven = fitted.names, fitted.chain.joints[2].driven
+    parts = fitted.problem.system(fitted.problem.sets).rows_of(fitted.chain, [*names, driven])
+    rows = stacked(parts)
+    one = rows[:, [[*names, driven].index(driven)]]
+    column = one * (level[row_samples(parts), np.newaxis] == np.arange(4))
+    drawn = rng.uniform(-0.5, 0.5, (4, 4000))
+    shifts = np.linalg.lstsq(rows[:, : len(names)], column @ drawn, rcond=None)[0]
+    joints = UR10E.random_joints(200, np.random.default_rng(0))
+    moves = ErrorModel(fitted.chain, names).jacobian(joints)[:, :3]
+    moved = np.sqrt(np.mean(np.sum((moves @ shifts) ** 2, axis=1)))
+    corrected = (fitted.chain.forward(joints) - before.forward(joints))[:, :3, 3]
+    monkeypatch.setattr(special, 'chdtri', lambda *_: 1e-12)  # the rest may be rounding
+    half = 0.5 * np.sqrt(np.mean(np.sum(corrected**2, axis=1))) / moved
+    for step, told in ((0.9 * half, False), (1.1 * half, True)):
+        assert rounding.may_be_rounding(fitted, before, {'elbow_joint': step}) == told
+    assert not rounding.may_be_rounding(fitted, before, {})
 
 
 def test_a_joint_that_moves_in_outliers_only_is_named(rng):
