@@ -71,11 +71,11 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
     return found
 
 
-def error_by_rounding(problem: Problem, coarse: Mapping[str, float]) -> float:
+def error_by_rounding(problem: Problem) -> float:
     """Return the RMS position error [m] of the flange that rounded joint values cause."""
     joints, chain = np.concatenate([each.spread().joints for each in problem.sets]), problem.chain
     squares = 0.0
-    for name, step in coarse.items():
+    for name, step in rounded_joints(problem).items():
         moved = joints + step * (np.array(chain.joint_names) == name)
         shift = (chain.forward(moved) - chain.forward(joints))[:, :3, 3]
         squares += float(np.mean(np.sum(shift**2, axis=-1))) / 12.0

@@ -35,6 +35,8 @@ BRINGS = {
     Rule.GAIN: {Rule.ORIENTATION},
 }
 """Consequences of each cause; the first cause told counts."""
+TOLD_TWICE = {Rule.LAG, Rule.SCALE}
+"""Rules whose steps tell the last part of their reasons, too."""
 
 FAR = 1.0 / EXCEPTION
 """Ratio of residuals to stated noise that an arm's own errors rarely reach."""
@@ -92,10 +94,17 @@ class Situation:
     needless: tuple[str, ...] = ()
     rounding: float = 0.0
 
+    @property
+    def coarse(self) -> bool:
+        """Tell whether the measurements are far too coarse, and not by rounding."""
+        return self.left >= FAR and not self.rounding
+
     def first_of(self, rule: Rule) -> tuple[str, ...]:
         """Return what to do before the steps of a rule."""
-        if rule in {*UNSURE, Rule.LARGEST_ERROR} and self.rounding:
-            return (DIGITS.format(self.rounding),)
+        rounded = rule in {*UNSURE, Rule.LARGEST_ERROR} and self.rounding
+        return (*[DIGITS.format(self.rounding)] * bool(rounded), *self._first_of(rule))
+
+    def _first_of(self, rule: Rule) -> tuple[str, ...]:
         if rule in {Rule.GAIN, Rule.LARGEST_ERROR} and self.contradicted:
             return (IN_BETWEEN,)
         if rule is Rule.LARGEST_ERROR and self.outliers:
@@ -108,7 +117,7 @@ class Situation:
 
     def said_of(self, one: Advice) -> Advice:
         """Return the advice on an unproven correction that suits the situation."""
-        if self.left >= FAR and not self.rounding:
+        if self.coarse:
             return replace(one, steps=(COARSE.format(self.left), *one.steps))
         if self.poses < ENOUGH:
             marked = zip(one.steps, one.unless, strict=True)
@@ -137,12 +146,12 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
         short = general.heading
         if rule is Rule.MISTAKE:
             short += f': {"; ".join(each.short for each in texts)}'
-        needless = (*situation.needless, *['coarse'] * (situation.left >= FAR))
+        needless = (*situation.needless, *['coarse'] * situation.coarse)
         marked = zip(general.steps, general.unless, strict=True)
         kept = [each for each in marked if each[1] not in needless]
         steps, unless = (tuple(each[k] for each in kept) for k in (0, 1))
         told = replace(general, steps=steps, unless=unless)
-        named = texts if rule is Rule.MISTAKE else [each.short for each in texts]  # the steps tell
+        named = [each.short for each in texts] if rule in TOLD_TWICE else texts
         refusal = replace(told, refusal='; '.join(named), in_short=short)
         if rule in UNSURE:
             refusal = situation.said_of(refusal)

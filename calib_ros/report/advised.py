@@ -11,7 +11,7 @@ import numpy as np
 from calib_ros.apply.confidence import interval_of
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
-from calib_ros.decision.rounding import error_by_rounding, rounded_joints
+from calib_ros.decision.rounding import error_by_rounding
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.problem import Problem
 from calib_ros.report import words
@@ -51,7 +51,7 @@ def advice_of(problem: Problem, result: Identification) -> tuple[Advice, ...]:
     marks |= {'zeros': zeros, 'lengths': not zeros}
     needless = tuple(mark for mark, holds in marks.items() if holds)
     remains = (judged or result.fitted).figures[1].rms_mm
-    rounded_by = 1e3 * error_by_rounding(problem, rounded_joints(problem))
+    rounded_by = 1e3 * error_by_rounding(problem)
     rounding = rounded_by if 2.0 * rounded_by > remains else 0.0
     about = words.drifts(result.noise), len(result.outliers), contradicted, needless, rounding
     return advice(result.refusals, Situation(poses, noise, sigma, *about))

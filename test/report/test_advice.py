@@ -128,6 +128,21 @@ def test_a_remedy_is_told_once():
     assert 'linear joint' not in ' '.join(told.steps)
 
 
+@pytest.mark.parametrize('rule', [rule for rule in Rule if rule not in advice.TOLD_TWICE])
+def test_what_no_step_tells_is_told_of_the_reason(rule):
+    """Several targets to be named, distances to be corrected, the loss to be allowed were not."""
+    (told,) = advice.advice([Reason(rule, 'moved by 4 mm', '; subtract 3 mm')])
+    assert told.refusal == 'moved by 4 mm; subtract 3 mm'
+
+
+def test_rounding_hides_no_other_cause():
+    """It may be half of what is left: a drift of 3 mm was neither named nor looked for."""
+    found = advice.Situation(left=advice.FAR, drifts=True, rounding=2.7)
+    (told,) = advice.advice([Reason(Rule.GAIN, 'no gain')], found)
+    assert told.steps[:2] == (advice.DIGITS.format(2.7), advice.DRIFTS)
+    assert any('device to the floor' in step for step in told.steps)
+
+
 @pytest.mark.parametrize(
     ('digits', 'first'), [(2, 'Record the joint values'), (3, 'The remaining')]
 )
