@@ -122,6 +122,8 @@ class Clocks:
             if known is not None:
                 self._moves.append((found.seconds - known.seconds, self._agreed))
             self._seen, self._unclear = found, None
+        elif found.within < known.within and not found.rivals:
+            self._seen = found  # known better
         self._agreed = self._taken
         self._awake = self._continuous
 
