@@ -209,9 +209,13 @@ def _best_trials(
         tried.append((each, each.chain or chain, each.undo_in(few)))
     rough = zip(trials_of(one[1:] for one in tried), (each for each, *_ in tried), strict=True)
     better = (one for one in rough if one[0].share < given.share)
-    best = sorted(better, key=lambda one: one[0].share)[:TRIED]
-    refined = [(refine_trial(problem, found), each) for found, each in best]
-    return sorted(refined, key=lambda one: one[0].share)
+    best = sorted(better, key=_rounded_share)[:TRIED]
+    return sorted(((refine_trial(problem, one), each) for one, each in best), key=_rounded_share)
+
+
+def _rounded_share(tried: tuple[Trial, Suspect]) -> float:
+    """Return the share of a trial that rounding leaves alone: equivalent ones keep their order."""
+    return float(f'{tried[0].share:.6g}')
 
 
 def _named(
