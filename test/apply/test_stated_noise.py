@@ -14,10 +14,12 @@ from calib_ros.apply.verification import verify
 from calib_ros.cli.common import settings_of
 from calib_ros.cli.parser import parser_of
 from calib_ros.errors import InputError
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibration import recalibrate
+from calib_ros.kinematics.joint import Frame
 from calib_ros.kinematics.se3 import norms
 from calib_ros.report.documents import verification_document
 from calib_ros.report.remarks import caveats
@@ -123,6 +125,29 @@ def test_few_poses_show_a_slip_and_a_bent_link(cell, arm, offsets):
     for seed in range(4):
         q = UR.random_joints(10, np.random.default_rng(seed))
         assert verify(arm, [measured(changed, q, 1)], None).verdict == 'does not hold'
+
+
+def test_noise_of_distances_is_along_the_wires(rng):
+    """It counted three times, and hid a slip that was larger than the noise."""
+
+    def distances(arm, noise):
+        found = []
+        for k, anchor in enumerate(((1.5, 0.4, -0.5), (-1.0, 1.5, 0.2), (0.3, -1.8, 0.9))):
+            q = UR.random_joints(40, rng)
+            ways = arm.forward(q)[:, :3, 3] - anchor
+            lengths = norms(ways) + noise * rng.normal(size=len(q))
+            each = Observations.from_arrays(q, ways)
+            found.append(replace(each, distances=lengths, base=f'base_{k}'))
+        return found
+
+    true = replace(measured_arm(rng, 1)[1], base=Frame())
+    first, *more = distances(true, NOISE[0])
+    coarse = 5.0 * NOISE[0]
+    arm = Calibration.of(identify(Problem(UR, first, more=more, sigma_position=NOISE[0])))
+    slipped = true.with_offsets({'elbow_joint.theta': 1e-3})
+    for now, verdict in ((true, 'UNDECIDED'), (slipped, 'does not hold')):
+        for sigma in (coarse, None):
+            assert judge(arm, distances(now, coarse), sigma_position=sigma).verdict == verdict
 
 
 def test_nothing_measured_is_told(cell, arm):
