@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real node in real rclpy when something goes wrong: dead sources, wrong messages."""
 
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
@@ -13,7 +16,7 @@ from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import String
 
 from calib_ros.files.archive import Archive
-from calib_ros.ros import inputs as inputs_module, node as node_module
+from calib_ros.ros import deferred, inputs as inputs_module, node as node_module
 from calib_ros.ros.advisor import Guide
 from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.outputs import Keeper
@@ -228,4 +231,17 @@ def test_heavy_losses_are_refused_as_in_a_bag_unless_they_are_allowed(cell, reco
     assert f'{told} ... full text: ' in answer.message
     assert f'{told}; remove the cause, or accept the rest with' in cell.in_full(answer)
     assert cell.set_parameters({'largest_loss': 0.26})[0].successful
+    cell.done('identify')
+
+
+def test_without_a_thread_it_is_done_all_the_same(cell, recording, monkeypatch):
+    """On a machine with too many processes the call was never answered, nor the node closed."""
+    cell.play(topics(recording))
+    start = MagicMock(side_effect=RuntimeError("can't start new thread"))
+    none = SimpleNamespace(Thread=lambda **_: SimpleNamespace(start=start))
+    monkeypatch.setattr(deferred, 'threading', none)
+    cell.done('identify')
+    cell.done('save')
+    assert start.call_count == 2
+    monkeypatch.undo()
     cell.done('identify')

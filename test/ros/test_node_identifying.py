@@ -22,7 +22,6 @@ from calib_ros.files.history import History
 from calib_ros.identification import recalibration
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
-from calib_ros.ros import deferred
 from calib_ros.ros.arguments import NODE
 from calib_ros.ros.calls import InOrder
 from calib_ros.ros.identifying import ONE_BEFORE
@@ -72,19 +71,6 @@ def test_messages_are_taken_while_an_identification_runs(tmp_path, recording, he
         release.set()
         cell.spin_until(again.done)
         assert again.result().success, again.result().message
-
-
-def test_without_a_thread_it_is_done_all_the_same(cell, recording, monkeypatch):
-    """On a machine with too many processes the call was never answered, nor the node closed."""
-    cell.play(topics(recording))
-    start = MagicMock(side_effect=RuntimeError("can't start new thread"))
-    none = SimpleNamespace(Thread=lambda **_: SimpleNamespace(start=start))
-    monkeypatch.setattr(deferred, 'threading', none)
-    cell.done('identify')
-    cell.done('save')
-    assert start.call_count == 2
-    monkeypatch.undo()
-    cell.done('identify')
 
 
 def test_a_noisier_device_condemns_no_arm(tmp_path, recording, rng, monkeypatch):
