@@ -13,7 +13,7 @@ import numpy as np
 from scipy import special
 
 from calib_ros.estimation.fitted import Fitted
-from calib_ros.estimation.levels import CLEARLY, CONFIDENT
+from calib_ros.estimation.levels import CERTAIN, CLEARLY, CONFIDENT
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.system import row_samples, stacked
@@ -33,19 +33,21 @@ RESOLUTIONS = (
 def rounded_joints(problem: Problem) -> dict[str, float]:
     """Return the joints whose values are multiples of a step [rad or m], with the step.
 
-    A few values may also be multiples of a wide one by chance: a step of other joints counts then.
-    None if some are hardly rad or m: the steps are of another unit.
+    A few values may be multiples of a wider step by chance: then that of other joints counts. None
+    if some are hardly rad or m: the steps are of another unit.
     """
     joints = np.concatenate([each.joints for each in problem.sets])
     if np.abs(joints).max() > TWO_TURNS:
         return {}
-    own = {
-        name: resolution_of(q) for name, q in zip(problem.chain.joint_names, joints.T, strict=True)
-    }
-    for name, values in zip(own, joints.T, strict=True):
-        steps = {*own.values()} - {0.0} if np.ptp(values) and not own[name] else ()
-        own[name] = max([own[name], *(s for s in steps if _are_multiples(values, s))])
-    return {name: step for name, step in own.items() if step > 0.0}
+    own = [resolution_of(q) for q in joints.T]
+    steps, found = sorted({*own} - {0.0}), {}
+    for joint, step, q in zip(problem.chain.joint_names, own, joints.T, strict=True):
+        count = len(np.unique(q))
+        by_chance = (s for s in steps if (s / (step or s)) ** count > 1.0 - CERTAIN)
+        likely = [s for s in by_chance if count > 1 and _are_multiples(q, s)]
+        if likely:
+            found[joint] = likely[0]
+    return found
 
 
 def resolution_in_words(step: float, unit: str) -> str:

@@ -141,15 +141,18 @@ def test_what_rounding_gives_to_the_zero_of_a_joint(step, rng):
     q = UR10E.random_joints(40, rng)
     q[:, 1], q[:, 2] = step * rng.permutation(600)[:40], step * np.repeat([0, 1, 3], [20, 10, 10])
     q[:, 3] = step * np.repeat([0, 1], 20)  # two values tell no step, but may have that of others
+    q[:, 0] = step * np.repeat([0, 2, 4], [20, 10, 10])  # even by chance
     q[:, 5] = 0.0
     problem = Problem(UR10E, measure(UR10E, q, rng))
     q[7, 4] = 45.0  # as in degrees
     assert rounded_joints(Problem(UR10E, measure(UR10E, q, rng))) == {}
     steps = rounded_joints(problem)
-    assert steps == {'shoulder_lift_joint': step, 'elbow_joint': step, 'wrist_1_joint': step}
+    assert list(steps) == [*UR10E.joint_names[:4]]
+    assert {*steps.values()} == {step}
     one = step / np.sqrt(12.0)
     assert rounding_errors(problem, steps) == pytest.approx(
         {
+            'shoulder_pan_joint.theta': one * np.sqrt(0.5**2 + 2 * 0.25**2),
             'shoulder_lift_joint.theta': one / np.sqrt(40.0),
             'elbow_joint.theta': one * np.sqrt(0.5**2 + 2 * 0.25**2),
             'wrist_1_joint.theta': one * np.sqrt(0.5),
