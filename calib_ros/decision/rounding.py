@@ -33,14 +33,15 @@ RESOLUTIONS = (
 def rounded_joints(problem: Problem) -> dict[str, float]:
     """Return the joints whose values are multiples of a step [rad or m], with the step.
 
-    A few values may be multiples of a wider step by chance: then that of other joints counts. None
-    if some are hardly rad or m: the steps are of another unit.
+    A few values may be multiples of a wider step by chance, and two tell none: then that of other
+    joints, or of all together, counts. None if some are hardly rad or m: the steps are of another
+    unit.
     """
     joints = np.concatenate([each.joints for each in problem.sets])
     if np.abs(joints).max() > TWO_TURNS:
         return {}
     own = [resolution_of(q) for q in joints.T]
-    steps, found = sorted({*own} - {0.0}), {}
+    steps, found = sorted({*own, resolution_of(joints.ravel())} - {0.0}), {}
     for joint, step, q in zip(problem.chain.joint_names, own, joints.T, strict=True):
         count = len(np.unique(q))
         by_chance = (s for s in steps if (s / (step or s)) ** count > 1.0 - CERTAIN)

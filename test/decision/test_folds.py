@@ -160,6 +160,20 @@ def test_what_rounding_gives_to_the_zero_of_a_joint(step, rng):
     )
 
 
+@pytest.mark.parametrize('step', [1e-2, 1e-3])
+def test_two_values_of_each_joint_tell_a_step_together(step, rng):
+    """Three of six healthy arms were accepted, 0.2 mm off: nothing was taken for rounded."""
+    which = rng.integers(2, size=(40, 6))
+    for levels, told in (
+        (rng.uniform(-2.0, 2.0, (6, 2)), step),
+        (np.pi / 6 * np.eye(6)[:, :2], 0),
+    ):
+        q = levels[np.arange(6), which]
+        q = step * np.round(q / step) if told else q  # else multiples of 30 degrees
+        found = rounded_joints(Problem(UR10E, measure(UR10E, q, rng)))
+        assert found == (dict.fromkeys(UR10E.joint_names, step) if told else {})
+
+
 def test_a_step_is_told_in_the_unit_of_the_file():
     """Of joint values in degrees it was "0.175 mrad"."""
     found = (1e-4, 'rad'), (np.deg2rad(0.01), 'rad'), (np.deg2rad(0.2), 'rad'), (5e-4, 'm')
