@@ -72,7 +72,7 @@ def _beside_all(chain: Chain, sets: Sequence[Observations], worn: Sequence[Param
     except (InputError, np.linalg.LinAlgError):
         return np.inf
     share = covariance(fitted.factor) @ fitted.robust.fit.normal.parts[0]
-    count = sum(len(each) * (3 if each.distances is None else 1) for each in sets)
+    count = float(sum(each.ways.sum() for each in sets))
     taken = float(np.trace(share))
     free = min(count - taken, count - 2.0 * taken + float(np.sum(share * share.T)))
     if free < TELLING:

@@ -184,8 +184,8 @@ def _noise_beyond(
         problem = replace(problem, sigma_position=stated)
         now = arm.noise.expected_in(problem, ('sigma_position',)).sigma_position
     found = np.concatenate([each.covariances((now, 1.0))[:, :3, :3] for each in sets])
-    ways = np.repeat([3.0 if s.distances is None else 1.0 for s in sets], [len(s) for s in sets])
-    squares = np.trace(found, axis1=1, axis2=2) * ways / 3.0  # distances are along one line
+    ways = np.concatenate([each.ways for each in sets])
+    squares = np.trace(found, axis1=1, axis2=2) * ways / 3.0
     return max(0.0, float(squares.mean()) - max(float(ways.mean()) * then**2, arm.residual**2))
 
 

@@ -290,6 +290,11 @@ class Observations(Shown):
         return 1 if self.distances is not None else 6 if self.turned else 3
 
     @property
+    def ways(self) -> FloatArray:
+        """Return in how many of the three directions each error (N,) was measured."""
+        return np.full(len(self), 3.0 if self.distances is None else 1.0)
+
+    @property
     def moving(self) -> bool:
         """Tell whether the arm moved while it was measured, so that a delay matters."""
         return self.velocity is not None and bool(self.velocity.any())

@@ -233,12 +233,12 @@ class Calibration(Shown):
         if self.residual is None:
             return None
         former = ALIKE * self.residual
-        joints = [each.spread().joints for each in sets if not each.socket]
-        if not joints:
+        seen = [each.spread() for each in sets if not each.socket]
+        if not seen:
             return former
-        q = np.concatenate(joints)
+        q, ways = (np.concatenate([getattr(s, key) for s in seen]) for key in ('joints', 'ways'))
         sizes = np.nan_to_num(self.sigma(q)), self.removed(q)[0]
-        expected, removed = (float(np.sqrt(np.mean(each**2))) for each in sizes)
+        expected, removed = (float(np.sqrt(np.mean(ways / 3.0 * each**2))) for each in sizes)
         return max(former, min(ALIKE * expected, removed, 1e-3 * rms_mm))
 
     def reused(self, sets: Sequence[Observations]) -> float:

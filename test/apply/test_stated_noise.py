@@ -150,6 +150,15 @@ def test_noise_of_distances_is_along_the_wires(rng):
             assert judge(arm, distances(now, coarse), sigma_position=sigma).verdict == verdict
 
 
+def test_errors_along_wires_are_one_third_of_their_squares(arm):
+    """A slip of 1 mrad beside three wires was within the limit: it was that of all directions."""
+    exact, q = replace(arm, residual=0.0), UR.random_joints(5, np.random.default_rng(0))
+    points = Observations.from_arrays(q, UR.forward(q)[:, :3, 3])
+    wires = replace(points, distances=norms(points.positions))
+    assert exact.limit([wires]) == pytest.approx(exact.limit([points]) / np.sqrt(3.0))
+    assert exact.limit([wires, wires, points]) < exact.limit([points])
+
+
 def test_nothing_measured_is_told(cell, arm):
     """It ended in a traceback."""
     none = measured(cell[0], UR.random_joints(2, np.random.default_rng(0)), 1).select(np.arange(0))
