@@ -169,9 +169,10 @@ def shared_files(folder: str) -> dict[str, Path]:
 def parse_chain(text: str, where: str = 'chain file') -> Chain:
     """Parse the text of a chain file; errors name it `where`."""
     document = parse_yaml(text, where)
-    if isinstance(document, dict) and 'units' in document:
-        fixed = 'lengths are in metres, angles in radians'
-        raise UnknownNameError(f'{where}: key', 'units', CHAIN_KEYS, fixed)
+    for key in document if isinstance(document, dict) else ():
+        if str(key).lower() in ('unit', 'units'):
+            fixed = 'lengths are in metres, angles in radians'
+            raise UnknownNameError(f'{where}: key', key, CHAIN_KEYS, fixed)
     content = parse_mapping(document, CHAIN_KEYS, where, ('joints',))
     if content.get('convention') is None:
         raise ConfigError(f'{where}: key "convention" is missing: standard or modified')

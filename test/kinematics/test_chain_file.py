@@ -168,7 +168,7 @@ WRONG = [
     ('d: 0.1273', 'd: ', 'joint 1: key "d" is missing'),
     ('name: joint_1', 'name: null', 'joint 1: key "name" is missing'),
     ('convention: standard', '', 'key "convention" is missing: standard or modified'),
-    ('convention: standard', 'units: mm', 'lengths are in metres, angles in radians'),
+    ('convention: standard', 'Units: mm', 'lengths are in metres, angles in radians'),
     ('joints:', 'calibration:', 'key "joints" is missing'),
     ('theta: 0.0', 'theta: 90', 'joint 1: theta must be in radians, not 90: write .* as 1.570796'),
     ('sign: 1', 'sign: 2', 'joint 1: sign must be 1 or -1, not 2'),
