@@ -106,9 +106,9 @@ class Evidence:
             slope = weight @ mean**2 - gamma - width * (size - self._typical)
             step = slope / (2.0 * np.maximum(gamma, 0.0) + width)
             step = np.maximum(np.minimum(step, 1.0), -1.0)  # np.clip is slow
-            size = self._within(size + step)
+            last, size = size, self._within(size + step)
             self._lengthen(mean**2 + variance, 0.0, size)
-            if np.abs(step).max(initial=0.0) < SETTLED:
+            if np.abs(size - last).max(initial=0.0) < SETTLED:
                 break
         for k, name in enumerate(self._names):
             if name in considered:
