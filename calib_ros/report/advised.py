@@ -46,7 +46,8 @@ def advice_of(problem: Problem, result: Identification) -> tuple[Advice, ...]:
     zeros = all(name.kind == 'theta' for name in far)
     marks = {'auto': result.verdicts, 'table': not problem.of_messages, 'no_wires': not wires}
     marks |= {'images': result.images, 'no_images': not result.images}
-    marks |= {'no_sockets': not any(each.socket for each in problem.all_sets)}
+    sockets = [each.socket for each in problem.all_sets]
+    marks |= {'no_sockets': not any(sockets), 'no_device': result.images or all(sockets)}
     marks |= {'no_linear': all(joint.driven.unit == 'rad' for joint in problem.chain.joints)}
     marks |= {'zeros': zeros, 'lengths': not zeros}
     needless = tuple(mark for mark, holds in marks.items() if holds)

@@ -123,9 +123,19 @@ def test_a_joint_that_stood_still_is_told_before_the_scale():
 def test_a_remedy_is_told_once():
     """On the page the sentence of the rule and the last step told the same."""
     reason = Reason.with_remedy(Rule.SCALE, 'lengths shrink. If that is right, set sigma_scale')
-    (told,) = advice.advice([reason], advice.Situation(needless=('images', 'no_linear')))
+    (told,) = advice.advice([reason], advice.Situation(needless=('no_device', 'no_linear')))
     assert (str(reason)[-11:], told.refusal) == ('sigma_scale', 'lengths shrink')
-    assert 'linear joint' not in ' '.join(told.steps)
+    assert not any(word in ' '.join(told.steps) for word in ('linear joint', 'temperature'))
+
+
+@pytest.mark.parametrize('sockets', [False, True])
+def test_sockets_have_neither_temperature_nor_pressure(solved, sockets):
+    problem, result = solved
+    seen = replace(problem.observations, socket=sockets)
+    refused = replace(result, refusals=(Reason(Rule.SCALE, 'lengths shrink'),))
+    (told,) = advice_of(replace(problem, observations=seen, held_out=None), refused)
+    steps = ' '.join(told.steps)
+    assert ('temperature' not in steps) == ('measure their distance' in steps) == sockets
 
 
 @pytest.mark.parametrize('rule', [rule for rule in Rule if rule not in advice.TOLD_TWICE])
