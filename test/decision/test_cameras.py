@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import re
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +18,7 @@ from calib_ros.decision.scale import out_of_scale
 from calib_ros.kinematics.chain import Frame
 
 UR = load_chain('ur10e')
-POINTS = np.array([(0.04 * i, 0.04 * j, 0.0) for j in range(4) for i in range(6)])
+POINTS = np.array([(0.06 * i, 0.06 * j, 0.0) for j in range(3) for i in range(4)])
 LENS = Camera().lens
 
 
@@ -25,6 +26,7 @@ def nominal(on_flange, lens=LENS):
     return UR.with_frame('tool' if on_flange else 'base', Frame(lens=lens))
 
 
+@cache
 def images(on_flange, seed=3, errors=1.0):
     rng = np.random.default_rng(seed)
     true = before_camera(arm(seed, errors), Camera(), POINTS, on_flange, rng)

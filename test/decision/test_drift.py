@@ -3,7 +3,6 @@
 """A drifting tracker must not pass for a gain of the arm."""
 
 from dataclasses import replace
-from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
@@ -57,25 +56,25 @@ def session(seed, errors, kind, count=96, width=0.8, shuffled=False, true=None):
 
 @pytest.mark.parametrize('kind', DRIFTS)
 def test_a_drift_is_no_gain_of_the_arm(kind):
-    """At 95 %: of 6 arms without any error two or more are accepted once in 30 times."""
-    results = [identify(Problem(UR10E, session(seed, 0.0, kind), **SIGMAS)) for seed in range(6)]
+    """At 95 %: of 4 arms without any error two or more are accepted once in 70 times."""
+    results = [identify(Problem(UR10E, session(seed, 0.0, kind), **SIGMAS)) for seed in range(4)]
     assert sum(result.accepted for result in results) <= 1
     # by held-out poses alone most of them would be
     alone = [all(each.rule is Rule.DRIFT for each in result.refusals) for result in results]
-    assert sum(alone) > 2
+    assert sum(alone) > 1
 
 
 def test_an_arm_with_errors_is_accepted_though_the_tracker_drifts():
-    """One of eight may be refused: 0.3 mm of drift in a narrow path leave its risk above 2 %.
+    """One may be refused: 0.3 mm of drift in a narrow path leave its risk above 2 %.
 
     So does an arm whose lengths err alike by chance: the device may have a scale.
     """
     accepted = 0
-    for seed, kind in product(range(2), DRIFTS):
+    for seed, kind in enumerate(DRIFTS):
         accepted += identify(Problem(UR10E, session(seed, 1.0, kind), **SIGMAS)).accepted
         shuffled = session(seed, 0.3, kind, width=None, shuffled=True)
         accepted += identify(Problem(UR10E, shuffled, **SIGMAS)).accepted
-    assert accepted >= 14
+    assert accepted >= 7
 
 
 def test_the_chance_is_uniform_where_there_is_nothing_to_gain():
@@ -98,10 +97,10 @@ def test_the_chance_is_uniform_where_there_is_nothing_to_gain():
 
 
 def test_a_drift_of_the_tracker_chooses_no_effects():
-    """At 99 % a group: of 8 sessions one or none."""
+    """At 99 % a group: of 4 sessions one or none."""
     chosen = 0
-    for seed in range(8):
-        design = ('walk', 60, None) if seed % 4 < 2 else ('swing', 120, 0.8)
+    for seed in range(4):
+        design = ('walk', 60, None) if seed < 2 else ('swing', 120, 0.8)
         problem = Problem(UR10E, session(seed, 0.0, *design), **SIGMAS)
         chosen += bool(identify_model(problem, 'auto').chain.effects)
     assert chosen <= 1

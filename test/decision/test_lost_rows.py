@@ -32,9 +32,8 @@ def test_rows_lost_in_one_of_two_tables_are_named(positions, joints, oriented, s
     *_, seen = measured_arm(1, 40, oriented=oriented)
     measured = seen.select(np.delete(np.arange(len(seen)), positions))
     kept = np.delete(seen.joints, joints, axis=0)
-    result = identify(Problem(UR10E, replace(measured, joints=kept)))
-    assert not result.accepted
-    assert result.refusals[0].startswith(f'{said} their measurement')
+    told = str(diagnose(Problem(UR10E, replace(measured, joints=kept))))
+    assert told.startswith(f'{said} their measurement')
 
 
 @pytest.mark.parametrize(('row', 'told'), [(20, True), (30, False)])
@@ -181,9 +180,7 @@ def test_a_source_that_repeats_its_last_value_is_named(part, rows_of):
     for values in held.values():
         values[rows] = values[7]
     of_messages = rows_of.startswith('poses')  # of a simulation, stamps in whole seconds
-    result = identify(Problem(UR10E, replace(seen, **held), of_messages=of_messages))
-    assert not result.accepted
-    said = ' '.join(map(str, result.refusals))
+    said = str(diagnose(Problem(UR10E, replace(seen, **held), of_messages=of_messages)))
     assert f'the {part} repeated in {rows_of} while the rest moved' in said
 
 
@@ -229,8 +226,9 @@ def test_gross_errors_at_poses_measured_again_and_again_are_no_repeated_joint_va
     assert 'repeated' not in ' '.join(map(str, result.remarks))
 
 
-@pytest.mark.parametrize('order', ['below', 'above', 'beside'])
-@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize(
+    ('order', 'oriented'), [('below', True), ('above', False), ('beside', True)]
+)
 def test_nominal_poses_among_measured_ones_are_named(order, oriented):
     """Under one header without a title they were fitted: half of the errors stayed."""
     rng, rows = np.random.default_rng(3), np.arange(80)

@@ -33,8 +33,9 @@ def scaled(observations, ppm):
     return replace(observations, positions=observations.positions * (1.0 + 1e-6 * ppm))
 
 
-@pytest.mark.parametrize('name', ['ur10e', 'puma560', 'kuka_iiwa14'])
-@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize(
+    ('name', 'oriented'), [('ur10e', False), ('puma560', True), ('kuka_iiwa14', False)]
+)
 def test_a_device_out_of_scale_is_named(name, oriented):
     chain = load_chain(name)
     seen = seen_of(arm(0, 0.0, chain), oriented=oriented)
@@ -59,7 +60,7 @@ def test_a_joint_that_only_goes_one_way_is_named():
 
 @pytest.mark.parametrize('errors', [0.1, 1.0, 3.0])
 def test_healthy_and_faulty_arms_are_not_suspicious(errors):
-    for seed in range(4):
+    for seed in range(2):
         result = identify(Problem(UR, seen_of(arm(seed, errors), seed, oriented=seed % 2 == 0)))
         assert result.remarks == ()
         assert result.accepted
@@ -113,17 +114,17 @@ def test_the_share_explained_is_that_of_least_squares():
         assert (explained_share(few, chain, names, added) > 0.0) == some
 
 
-@pytest.mark.parametrize('sigma', [0.05, 5e-3])
 @pytest.mark.parametrize('oriented', [True, False])
-def test_sigmas_in_millimetres_are_named(sigma, oriented):
+def test_sigmas_in_millimetres_are_named(oriented):
     """They make the arm's errors smaller than any noise: nothing else may be blamed for it."""
     seen = seen_of(arm(3), count=40, oriented=oriented)
-    sigmas = {'sigma_position': sigma, 'sigma_orientation': 4.0 * sigma}
-    result = identify(Problem(UR, seen, **sigmas))
-    said = result.remarks[-1] if result.accepted else result.refusals[0]
-    assert f'sigma_position is {sigma:g} m, and only' in said
-    assert said.count('meant?') == 1 + oriented
-    assert result.accepted or result.refusals[0].rule is Rule.MISTAKE
+    for sigma in (0.05, 5e-3):
+        sigmas = {'sigma_position': sigma, 'sigma_orientation': 4.0 * sigma}
+        result = identify(Problem(UR, seen, **sigmas))
+        said = result.remarks[-1] if result.accepted else result.refusals[0]
+        assert f'sigma_position is {sigma:g} m, and only' in said
+        assert said.count('meant?') == 1 + oriented
+        assert result.accepted or result.refusals[0].rule is Rule.MISTAKE
     for good in (5e-5, 5e-4):
         sigmas = {'sigma_position': good, 'sigma_orientation': 4.0 * good}
         result = identify(Problem(UR, seen, **sigmas))
@@ -222,7 +223,7 @@ FOUR = Chain(
 )
 
 
-@pytest.mark.parametrize('seed', range(1, 5))
+@pytest.mark.parametrize('seed', [1, 4])
 def test_a_scale_that_few_lengths_imitate_is_refused_where_it_does_harm(seed):
     """By positions alone four joints hold so few lengths that no test is certain of the scale."""
     rng = np.random.default_rng(seed)
@@ -295,16 +296,26 @@ def test_most_of_the_fastest_third_is_compared_with_most_of_the_slowest(what):
         assert found.partition(' of the arm')[0] == told
 
 
-@pytest.mark.parametrize(('share', 'refused'), [(0.0, False), (1e-4, False), (1e-3, True)])
-@pytest.mark.parametrize(('oriented', 'straight'), [(True, False), (False, False), (False, True)])
+@pytest.mark.parametrize(
+    ('share', 'oriented', 'straight'),
+    [
+        (0.0, True, False),
+        (0.0, False, False),
+        (1e-4, True, False),
+        (1e-4, False, True),
+        (1e-3, True, False),
+        (1e-3, False, False),
+        (1e-3, False, True),
+    ],
+)
 def test_poses_that_lie_towards_the_stop_before_are_told_and_refused_where_it_harms(
-    share, refused, oriented, straight
+    share, oriented, straight
 ):
     """A device that smoothed over 0.8 s made an arm worse, 2.2 mm -> 3.3 mm, and was accepted.
 
     It smooths positions, straight to the stop before; arcs of the arm are twice as long.
     """
-    rng = np.random.default_rng(1)
+    rng, refused = np.random.default_rng(1), share == 1e-3
     joints = UR.random_joints(40, rng)
     behind = joints - share * np.diff(joints, axis=0, prepend=joints[:1]) * (not straight)
     seen = replace(measure(arm(0), behind, rng, 5e-5, 2e-4, oriented), joints=joints)
