@@ -12,8 +12,6 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 from statistics import median
 
-import pytest
-
 from calib_ros.cli.commands import COMMANDS
 
 PACKAGE = Path(__file__).parents[1] / 'calib_ros'
@@ -45,10 +43,15 @@ ONLY = {
 
 
 @cache
+def parsed(path):
+    return ast.parse(path.read_text())
+
+
+@cache
 def imports(path):
     """Return the names that a module imports, inside functions and for type checking as well."""
     found = set()
-    waiting = [ast.parse(path.read_text())]
+    waiting = [parsed(path)]
     while waiting:
         node = waiting.pop()
         if isinstance(node, ast.expr):
@@ -83,27 +86,26 @@ def test_the_page_names_modules_that_exist():
         assert f'{folder}.{name}' in MODULES or (not given and name in MODULES), name
 
 
-@pytest.mark.parametrize('module', MODULES)
-def test_modules_import_only_from_the_folders_before(module):
-    folder = module.rpartition('.')[0]
-    for name in imports(MODULES[module]):
-        package = name.partition('.')[0]
-        assert module.startswith(ONLY.get(package, ('',))), f'{module} imports {package}'
-        other = inner(name)
-        if other is None:
-            continue
-        there = other.rpartition('.')[0]
-        below = LEVEL.get(there, -1) < LEVEL.get(folder, -1)
-        assert there == folder or below, f'{module} imports {other}'
+def test_modules_import_only_from_the_folders_before():
+    for module, path in MODULES.items():
+        folder = module.rpartition('.')[0]
+        for name in imports(path):
+            package = name.partition('.')[0]
+            assert module.startswith(ONLY.get(package, ('',))), f'{module} imports {package}'
+            other = inner(name)
+            if other is None:
+                continue
+            there = other.rpartition('.')[0]
+            below = LEVEL.get(there, -1) < LEVEL.get(folder, -1)
+            assert there == folder or below, f'{module} imports {other}'
 
 
-@pytest.mark.parametrize('module', MODULES)
-def test_modules_and_functions_are_small(module):
-    text = MODULES[module].read_text()
-    assert text.count('\n') <= 400
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.FunctionDef):
-            assert node.end_lineno - node.lineno < 60, node.name
+def test_modules_and_functions_are_small():
+    for module, path in MODULES.items():
+        assert path.read_text().count('\n') <= 400, module
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.FunctionDef):
+                assert node.end_lineno - node.lineno < 60, f'{module}.{node.name}'
 
 
 def test_half_of_the_modules_are_read_at_a_glance():
@@ -114,7 +116,7 @@ def test_few_numbers_are_tuned():
     tuned = [
         f'{name}.{node.targets[0].id}'
         for name, path in MODULES.items()
-        for node in ast.parse(path.read_text()).body
+        for node in parsed(path).body
         if isinstance(node, ast.Assign)
         if isinstance(node.value, ast.Constant) and type(node.value.value) in (int, float)
     ]
@@ -124,7 +126,7 @@ def test_few_numbers_are_tuned():
 def defined(path):
     """Return the public names that a module defines at its top level."""
     found = set()
-    for node in ast.parse(path.read_text()).body:
+    for node in parsed(path).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             found.add(node.name)
         elif isinstance(node, ast.Assign | ast.AnnAssign):

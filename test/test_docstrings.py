@@ -6,7 +6,7 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
+from test_architecture import parsed
 
 PACKAGE = Path(__file__).parents[1] / 'calib_ros'
 MODULES = sorted(PACKAGE.rglob('*.py'))
@@ -21,13 +21,13 @@ def public_functions(body):
             yield node
 
 
-@pytest.mark.parametrize('path', MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_public_functions_of_arrays_give_their_shapes(path):
-    for function in public_functions(ast.parse(path.read_text()).body):
-        arguments = [*function.args.args, *function.args.kwonlyargs]
-        kinds = [each.annotation for each in arguments] + [function.returns]
-        kinds = ' '.join(ast.unparse(each) for each in kinds if each)
-        if not re.search(r'\b(FloatArray|NDArray|Index|Flags)\b', kinds):
-            continue
-        text = ast.get_docstring(function) or ''
-        assert re.search(r'\((\.{3}|\w[\w +]*,)[^)]*\)', text), f'{function.name}: (N, n), ...?'
+def test_public_functions_of_arrays_give_their_shapes():
+    for path in MODULES:
+        for function in public_functions(parsed(path).body):
+            arguments = [*function.args.args, *function.args.kwonlyargs]
+            kinds = [each.annotation for each in arguments] + [function.returns]
+            kinds = ' '.join(ast.unparse(each) for each in kinds if each)
+            if not re.search(r'\b(FloatArray|NDArray|Index|Flags)\b', kinds):
+                continue
+            text, where = ast.get_docstring(function) or '', f'{path.stem}.{function.name}'
+            assert re.search(r'\((\.{3}|\w[\w +]*,)[^)]*\)', text), f'{where}: (N, n), ...?'
