@@ -100,7 +100,7 @@ def test_pairs_of_a_configuration_that_share_their_error_count_once():
 def test_errors_of_stops_shared_by_targets_or_visits_are_no_wobble(tools):
     """Four seen at each stop: waves explained what the joints were off by there, five times."""
     shown = 0
-    for seed in range(1, 6):
+    for seed in range(1, 4):
         rng = np.random.default_rng(seed)
         true = faulty(UR10E, Cell(), rng)
         q = rng.uniform(-2.0, 2.0, (50, 6))

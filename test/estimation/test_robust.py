@@ -221,7 +221,7 @@ def in_branches(rng, *counts):
     return middles + widths * rng.uniform(-1.0, 1.0, middles.shape)
 
 
-@pytest.mark.parametrize('seed', [0, 2, 4])
+@pytest.mark.parametrize('seed', [0, 4])
 def test_a_target_knocked_before_the_only_poses_of_a_branch_spoils_no_others(seed):
     """Few poses can be explained, at the price of errors five times as large at the others."""
     nominal, rng = load_chain('abb_irb120'), np.random.default_rng([seed, 40, 3, 20])

@@ -179,7 +179,7 @@ def test_sockets_at_another_distance_than_stated_are_refused(error):
     assert any(each.rule is Rule.SCALE for each in result.refusals) == bool(error)
 
 
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 def test_an_arm_does_not_bend_to_a_distance_that_is_wrong(seed):
     """Of six between four sockets one is 1 mm off; arms without errors were corrected by it."""
     true, problem = cell(seed, noise=5e-5)

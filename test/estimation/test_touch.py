@@ -150,7 +150,7 @@ def test_what_planes_do_not_tell_is_held_and_uncertain(nominal, held):
     assert fitted.uncertainty.freedom[-1] == np.inf
 
 
-@pytest.mark.parametrize('seed', [2, 3, 6])
+@pytest.mark.parametrize('seed', [2, 6])
 def test_planes_alone_do_not_tell_a_gantry_whose_axes_are_askew(seed):
     _, sets = cell(seed, nominal=GANTRY)
     result = identify(Problem(GANTRY, sets[0], more=sets[1:], sigma_touch=SIGMA))
