@@ -189,13 +189,11 @@ def reasons_of(
         return ()
     tried = Counter(owner for owner, _ in columns.sets)
     tried |= Counter(dict.fromkeys(OUTSIDE, max(tried.values())))
-    logs = [
-        columns.evidence(information, names)[0] - np.log(tried[owner])
-        for owner, names in columns.sets
-    ]
+    likely, times = zip(*(columns.evidence(information, each) for _, each in columns.sets))
+    logs = np.subtract(likely, [np.log(tried[owner]) for owner, _ in columns.sets])
     found = [
-        _explanation(information, columns, freedom, *each, share)
-        for each, share in zip(columns.sets, special.softmax(logs).tolist(), strict=True)
+        _explanation(information, columns, freedom, *each, *rest)
+        for each, *rest in zip(columns.sets, special.softmax(logs).tolist(), times, strict=True)
     ]
     doubted = most < 1.0 and max(logs) <= 0.0
     # smooth errors of a device look like a warmer arm, which explains but does not claim
@@ -212,11 +210,12 @@ def _explanation(
     owner: str,
     names: tuple[Parameter, ...],
     share: float = 1.0,
+    times: float | None = None,
 ) -> Explanation:
     gain, change, covariance, rank = information.explained(columns.of(names))
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     chance = min(1.0, len(columns.sets) * chance_of(gain, rank, freedom))
-    times = columns.evidence(information, names)[1]
+    times = times or columns.evidence(information, names)[1]
     return Explanation(owner, names, gain, chance, share, change, sigma, times)
 
 
