@@ -25,7 +25,7 @@ from calib_ros.files.detector import Detector
 from calib_ros.files.images import decoded
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
-from calib_ros.sampling.board_finder import Flaw
+from calib_ros.sampling.sample import Flaw
 
 LENS = Lens(1350.0, 1350.0, 800.0, 600.0)
 SIZE = (1600, 1200)

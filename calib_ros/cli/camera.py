@@ -16,7 +16,7 @@ from calib_ros.files.bags import pictures
 from calib_ros.files.boards import BOARD_KEYS, Board, read_board
 from calib_ros.files.detector import Image, black_of, detect
 from calib_ros.files.images import SUFFIXES, image_files, image_of, read_image
-from calib_ros.sampling.board_finder import Flaw
+from calib_ros.sampling.sample import Flaw
 from calib_ros.texts import dump_yaml
 
 

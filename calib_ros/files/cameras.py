@@ -19,9 +19,8 @@ from calib_ros.files.detector import Detector
 from calib_ros.files.images import image_of
 from calib_ros.files.lenses import lens_of
 from calib_ros.kinematics.lens import Lens
-from calib_ros.sampling.board_finder import Flaw
 from calib_ros.sampling.messages import head_of
-from calib_ros.sampling.sample import View
+from calib_ros.sampling.sample import Flaw, View
 from calib_ros.sampling.source_texts import parse_sources
 from calib_ros.sampling.sources import Source
 

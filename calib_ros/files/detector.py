@@ -20,7 +20,7 @@ from calib_ros.files.boards import Board, grid
 from calib_ros.files.detections import Detections
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
-from calib_ros.sampling.board_finder import Flaw
+from calib_ros.sampling.sample import Flaw
 from calib_ros.settings import EXCEPTION
 
 Image = NDArray[np.uint8]  # grey

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import CalibrationError, InputError, UnknownNameError
 from calib_ros.files.detector import Image, opencv
 from calib_ros.files.stored import LARGEST_IMAGE
-from calib_ros.sampling.board_finder import Flaw
+from calib_ros.sampling.sample import Flaw
 
 SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm')
 ENCODINGS = {'mono8': (1, ''), '8UC1': (1, ''), 'rgb8': (3, 'RGB'), 'bgr8': (3, 'BGR')}

@@ -23,8 +23,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.resection import board_poses, uncertainty
 from calib_ros.kinematics import se3
 from calib_ros.sampling.account import Cause, Lost
-from calib_ros.sampling.board_finder import BoardFinder, Flaw
-from calib_ros.sampling.sample import Sample, View
+from calib_ros.sampling.sample import Flaw, Sample, View
 from calib_ros.sampling.slices import POSES
 from calib_ros.texts import LARGEST_TABLE
 
@@ -46,7 +45,7 @@ class Pictures:
 
     def __init__(self, sigma: Callable[[], float]) -> None:
         self._sigma = sigma
-        self.cameras: Mapping[str, BoardFinder] = {}  # detectors by topic
+        self.cameras: Mapping[str, Any] = {}  # `BoardCamera` of files/cameras.py, by topic
         self._pool = ThreadPoolExecutor(1, 'images')
         self._last = 0
         self.patient = False

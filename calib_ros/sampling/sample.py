@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from calib_ros.errors import ConfigError
 from calib_ros.identification.records import Owner
@@ -25,6 +26,13 @@ class View:
     points: FloatArray
     pixels: FloatArray
     lens: Lens
+
+
+class Flaw(NamedTuple):
+    """Why an image is not used: its kind, and what was found in it."""
+
+    cause: str
+    reason: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)

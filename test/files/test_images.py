@@ -23,7 +23,7 @@ from calib_ros.files.images import decoded, read_image
 from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
-from calib_ros.sampling.board_finder import Flaw
+from calib_ros.sampling.sample import Flaw
 
 cv2 = pytest.importorskip('cv2')
 from photographs import CHARUCO, rendered

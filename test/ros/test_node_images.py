@@ -29,8 +29,8 @@ from calib_ros.kinematics.lens import Lens
 from calib_ros.ros.inputs import deserialised
 from calib_ros.sampling import pictures
 from calib_ros.sampling.batches import feed
-from calib_ros.sampling.board_finder import Flaw
 from calib_ros.sampling.messages import CAMERA_INFO, JOINT_STATE, PICTURES
+from calib_ros.sampling.sample import Flaw
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.source_texts import parse_sources
 from calib_ros.sampling.streams import Stream, source_streams

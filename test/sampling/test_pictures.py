@@ -12,8 +12,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling import pictures
-from calib_ros.sampling.board_finder import Flaw
-from calib_ros.sampling.sample import Sample, View
+from calib_ros.sampling.sample import Flaw, Sample, View
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import Part
 from calib_ros.sampling.source_texts import parse_sources
