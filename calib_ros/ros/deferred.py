@@ -12,7 +12,7 @@ from typing import Any
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from calib_ros.ros.boundary import Answer
+from calib_ros.ros.boundary import Answer, Work
 
 
 class DeferredTrigger:
@@ -22,20 +22,18 @@ class DeferredTrigger:
     threads, one for each such service and one for the rest, would need a lock around the session,
     and cost an idle node 13 % more. A call during the work is refused at once.
 
-    `prepare` returns a snapshot on the executor's thread, `work` answers from it. `answer` takes
-    the name and either of them, and converts its result or exception to an answer.
+    `prepare` returns the work on the executor's thread, with a snapshot of what it needs. `answer`
+    takes the name and either of them, and converts its result or exception to an answer.
     """
 
     def __init__(
         self,
         node: Node,
         name: str,
-        answer: Callable[[str, Callable[[], Answer]], Answer],
-        prepare: Callable[[], Any],
-        work: Callable[[Any], Answer],
+        answer: Callable[[str, Work], Answer],
+        prepare: Callable[[], Work],
     ) -> None:
-        self._answer = partial(answer, name)
-        self._prepare, self._work = prepare, work
+        self._answer, self._prepare = partial(answer, name), prepare
         self._thread: threading.Thread | None = None
         self._running = threading.Event()
         node.create_service(Trigger, name, self._on_call)
@@ -53,16 +51,16 @@ class DeferredTrigger:
 
     def _on_call(self, request: Any, response: Any) -> Any:
         """Return what begins the work (`InOrder.execute`), or the answer that it cannot."""
-        snapshot: list[Any] = []
+        work: list[Work] = []
 
         def prepare() -> Answer:
             if self.busy:
                 return False, 'refused: the previous call is still running; wait for its answer'
-            snapshot.append(self._prepare())
+            work.append(self._prepare())
             return True, ''
 
         response.success, response.message = self._answer(prepare)
-        return partial(self._begin, *snapshot, response) if snapshot else response
+        return partial(self._begin, *work, response) if work else response
 
     def _begin(self, *given: Any) -> None:
         self._running.set()
@@ -74,8 +72,8 @@ class DeferredTrigger:
         else:
             self._thread = thread
 
-    def _run(self, snapshot: Any, response: Any, send: Callable[[Any], None]) -> None:
-        response.success, response.message = self._answer(lambda: self._work(snapshot))
+    def _run(self, work: Work, response: Any, send: Callable[[Any], None]) -> None:
+        response.success, response.message = self._answer(work)
         self._running.clear()  # before the answer, since the caller may call again at once
         try:
             send(response)

@@ -38,7 +38,7 @@ from calib_ros.identification.recalibration import recalibrate
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import documents, words
 from calib_ros.ros.advisor import Guide
-from calib_ros.ros.boundary import Answer, Boundary
+from calib_ros.ros.boundary import Answer, Boundary, Work
 from calib_ros.ros.calls import InOrder
 from calib_ros.ros.deferred import DeferredTrigger
 from calib_ros.ros.diagnostics import Diagnostics
@@ -131,21 +131,21 @@ class CalibrationNode(Batched):
             (Trigger, '~/capture', self._on_capture),
             (Trigger, '~/remove_last', self._on_remove_last),
             (Trigger, '~/clear', self._on_clear),
-            (Trigger, '~/load', partial(self._unless_busy, self._on_load)),
+            (Trigger, '~/load', self._on_load),
             (SetBool, '~/record', self._on_record),
         ):
             self.create_service(kind, name, self._answering(name, callback))
-        identify, keeper, whose = self._identifying, self._keeper, self._saying_whose
-        slow: tuple[tuple[str, Callable[[], Any], Callable[[Any], Answer]], ...] = (
-            ('~/identify', lambda: identify.snapshot(self._inputs), identify.run),
-            ('~/export', *whose(partial(self._unless_busy, keeper.exportable), keeper.export)),
-            ('~/save', *whose(partial(self._unless_busy, keeper.to_save), keeper.save)),
-            ('~/check', *whose(self.session.recent, self._on_check)),
-            ('~/validate', *whose(self._to_judge, self._on_validate)),
-        )
+        identify, keeper = self._identifying, self._keeper
+        slow: dict[str, Callable[[], Work]] = {
+            '~/identify': lambda: partial(identify.run, identify.snapshot(self._inputs)),
+            '~/export': keeper.export,
+            '~/save': keeper.save,
+            '~/check': lambda: partial(self._on_check, *self.session.recent()),
+            '~/validate': self._to_validate,
+        }
         return {
-            name: DeferredTrigger(self, name, self._answer, partial(self._up_to_now, begin), work)
-            for name, begin, work in slow
+            name: DeferredTrigger(self, name, self._answer, partial(self._prepared, name, begin))
+            for name, begin in slow.items()
         }
 
     def announce(self) -> None:
@@ -256,28 +256,25 @@ class CalibrationNode(Batched):
 
     # Services
 
-    def _up_to_now(self, begin: Callable[..., Any], *arguments: Any) -> Any:
-        self._take_messages()
-        return begin(*arguments)
-
-    def _unless_busy(self, begin: Callable[..., Any], *arguments: Any) -> Any:
+    def _refuse_if_busy(self) -> None:
         if self._working['~/identify'].busy:
             raise InputError(
                 'refused: an identification is running, and may replace the calibration in use: '
                 'wait for its answer, or call ~/cancel'
             )
-        return begin(*arguments)
 
-    def _saying_whose(
-        self, begin: Callable[[], Any], work: Callable[[Any], Answer]
-    ) -> tuple[Callable[[], Any], Callable[[Any], Answer]]:
-        """Return both steps of a service; it says first if it uses an earlier calibration."""
+    def _prepared(self, name: str, begin: Callable[[], Work]) -> Work:
+        """Return the work of a service; it says first if it uses an earlier calibration."""
+        self._take_messages()
+        if name in WRITING:
+            self._refuse_if_busy()
+        earlier, work = '' if name == '~/identify' else self._identifying.earlier, begin()
 
-        def told(given: tuple[str, Any]) -> Answer:
-            success, text = work(given[1])
-            return success, given[0] + text
+        def told() -> Answer:
+            success, text = work()
+            return success, earlier + text
 
-        return lambda: (self._identifying.earlier, begin()), told
+        return told
 
     def _on_capture(self, request: Any) -> Answer:
         socket = self.get_parameter('socket').value
@@ -297,24 +294,22 @@ class CalibrationNode(Batched):
         self.session.remove_last()
         return True, f'{self._archive.trouble}pose {len(self.session.samples) + 1} removed'
 
-    def _to_judge(self) -> tuple[Calibration, list[Observations], Callable[..., str]]:
+    def _to_validate(self) -> Work:
         session = self.session
-        calibration, sets = session.since()
-        problem = partial(session.problem_of, session.usable)
-        return calibration, sets, partial(self._filer.file, problem, session.settings)
+        judged, problem = session.since(), partial(session.problem_of, session.usable)
+        file = partial(self._filer.file, problem, session.settings)
+        return partial(self._on_validate, file, *judged)
 
     def _on_validate(
-        self, given: tuple[Calibration, list[Observations], Callable[..., str]]
+        self, file: Callable[..., str], calibration: Calibration, sets: list[Observations]
     ) -> Answer:
-        calibration, sets, filed = given
         sigma = self.session.settings.given_sigma
         found = judge(calibration, sets, of_messages=True, sigma_position=sigma)
         row = partial(verification_row, calibration.chain, found, kind='validate')
-        text = words.verdict_in_words(found) + filed(row, table_hash(calibration.chain))
+        text = words.verdict_in_words(found) + file(row, table_hash(calibration.chain))
         return found.verdict == 'holds', text
 
-    def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:
-        calibration, problem = found
+    def _on_check(self, calibration: Calibration, problem: Problem) -> Answer:
         years = years_since(calibration.record, problem.all_sets)
         updated = recalibrate(calibration, problem, years)
         sets, sigma = problem.all_sets, self.session.settings.given_sigma
@@ -333,6 +328,7 @@ class CalibrationNode(Batched):
         return True, 'recording' if request.data else 'not recording: messages are not used'
 
     def _on_load(self, request: Any) -> Answer:
+        self._refuse_if_busy()
         return self._identifying.loaded(self._keeper.load())
 
     # Topics out
@@ -369,7 +365,7 @@ class CalibrationNode(Batched):
         answers = {'last identification': last, 'observability': observability}
         return answers | self._guide.figures()
 
-    def _answer(self, name: str, work: Callable[[], Answer]) -> Answer:
+    def _answer(self, name: str, work: Work) -> Answer:
         answer = self._boundary.answer(name, work)
         return self._identifying.shortened(answer) if name == '~/identify' else answer
 
@@ -377,7 +373,10 @@ class CalibrationNode(Batched):
         self, name: str, callback: Callable[[Any], Answer]
     ) -> Callable[[Any, Any], Any]:
         def answer(request: Any, response: Any) -> Any:
-            work = partial(self._up_to_now, callback, request)
+            def work() -> Answer:
+                self._take_messages()
+                return callback(request)
+
             response.success, response.message = self._boundary.answer(name, work)
             return response
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics.chain_file import chain_text, parse_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.ros import to_ros
+from calib_ros.ros.boundary import Answer, Work
 from calib_ros.ros.broadcast import Broadcast
 from calib_ros.ros.parameters import NodeValues
 from calib_ros.ros.to_ros import LATCHED
@@ -92,20 +94,19 @@ class Keeper:
             self._broadcast.publish(calibration.chain, *where)
         self._adopted(calibration, self._world(calibration))
 
-    def to_save(self) -> tuple[Published, Path | None]:
-        """Return the calibration to save, and `target_filename` as it is now."""
+    def save(self) -> Work:
+        """Return how the calibration, to `target_filename` as it is now, is saved."""
         if not self._published.text:
             raise InputError(
                 'there is no accepted calibration to save: ~/identify must accept one first'
             )
-        return self._published, self._named('target_filename')
+        return partial(self._save, self._published, self._named('target_filename'))
 
-    def save(self, found: tuple[Published, Path | None]) -> tuple[bool, str]:
+    def _save(self, published: Published, target: Path | None) -> Answer:
         """Write a calibration to the target or a new file, and its report beside it.
 
-        Returns success, and where. The calibration is saved even without the report.
+        Return success, and where. The calibration is saved even without the report.
         """
-        published, target = found
         path = self._archive.save(published.text, published.configuration, target)
         if published is self._published:
             self.unsaved = False
@@ -144,23 +145,18 @@ class Keeper:
         self.adopt(calibration, Published(text, ''))
         return f'{path}, {calibration.whose}{lost}'
 
-    def exportable(self) -> tuple[Calibration, FloatArray | None]:
-        """Return the calibration, and the joint values (N, n) of the samples."""
+    def export(self) -> Work:
+        """Return how the calibration, checked at the samples, is written in all formats."""
         session = self._session
         if session.calibration is None:
             raise InputError('there is no calibration to export: call ~/identify or ~/load first')
         joints = np.array([sample.joints for sample in session.samples])
         with self._lock:
-            return session.calibration, joints if len(joints) else None
+            return partial(self._export, session.calibration, joints if len(joints) else None)
 
-    def export(self, found: tuple[Calibration, FloatArray | None]) -> tuple[bool, str]:
-        """Write a calibration in all formats, checked at joint values (N, n).
-
-        Returns success, and where.
-        """
-        (calibration, joints), nominal = found, self._session.chain
+    def _export(self, calibration: Calibration, joints: FloatArray | None) -> Answer:
         chain, record = calibration.chain, calibration.record
-        links = self._given.links
+        nominal, links = self._session.chain, self._given.links
         forms = exports(chain, nominal, joints, record)
         forms += vendor_files(chain, nominal, record, self._urdf, links)
         if self._urdf:
