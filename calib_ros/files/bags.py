@@ -70,31 +70,24 @@ def replay(path: Path | str, session: CalibrationSession, progress: Notify = qui
     with unpacked_files(path) as folder:
         session.pictures.cameras = cameras_of(session.settings.sources)
         session.pictures.patient = True
-        return _replay(path, folder, session, progress)
-
-
-def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Notify) -> Replayed:
-    """Feed the files of a bag, or those unpacked from it, in a folder."""
-    rosbag2()  # required even for damaged files
-    try:
-        reader = _opened(path, folder)
-    except InputError:
-        if (found := stored.salvage(folder)) is None:
-            raise
-        return _salvaged(path, found, session, {})
-    with closing(reader):
-        available = stored.topic_types((c.topic, c.msgtype) for c in reader.connections)
-        defined = {c.msgtype: c.msgdef for c in reader.connections if c.msgdef.data}
-        streams, deserialise = _choose_streams(
-            session, available, partial(stored.read, reader), defined
-        )
-        counts = [c.msgcount for c in reader.connections if c.topic in streams]
-        expected = sum(count for count in counts if isinstance(count, int) and count > 0)
-        messages = stored.read(reader, streams)
-        count, problem = _feed(session, messages, deserialise, progress, expected)
-    if problem is not None and count == 0 and (found := stored.salvage(folder)) is not None:
-        found.problem = found.problem or problem
-        return _salvaged(path, found, session, defined)
+        rosbag2()  # required even for damaged files
+        try:
+            reader = _opened(path, folder)
+        except InputError:
+            if (found := stored.salvage(folder)) is None:
+                raise
+            return _salvaged(path, found, session, {})
+        with closing(reader):
+            available = stored.topic_types((c.topic, c.msgtype) for c in reader.connections)
+            defined = {c.msgtype: c.msgdef for c in reader.connections if c.msgdef.data}
+            on = partial(stored.read, reader)
+            streams, deserialise = _choose_streams(session, available, on, defined)
+            counts = [c.msgcount for c in reader.connections if c.topic in streams]
+            expected = sum(count for count in counts if isinstance(count, int) and count > 0)
+            count, problem = _feed(session, on(streams), deserialise, progress, expected)
+        if problem is not None and count == 0 and (found := stored.salvage(folder)) is not None:
+            found.problem = found.problem or problem
+            return _salvaged(path, found, session, defined)
     _check_links(streams)
     warnings = tuple(hint.text for hint in session.last_hints)
     if problem is not None:
@@ -162,13 +155,10 @@ def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
 
 
 def _choose_streams(
-    session: CalibrationSession,
-    available: Mapping[str, str],
-    messages_on: MessagesOn,
-    definitions: Definitions,
+    session: CalibrationSession, topics: Mapping[str, str], on: MessagesOn, known: Definitions
 ) -> tuple[dict[str, Stream], Deserialise]:
-    defined = {kind: each for kind, each in definitions.items() if kind in BODIES}
-    recorded = Recorded(available, messages_on, _deserialiser(defined))
+    defined = {kind: each for kind, each in known.items() if kind in BODIES}
+    recorded = Recorded(topics, on, _deserialiser(defined))
     streams = choose_topics(recorded, session.settings)
     for topic, stream in streams.items():
         if stream.type in BODIES and stream.type not in defined:

@@ -62,16 +62,12 @@ class History:
         names = self._names(self._root)
         return tuple(sorted(unquote(n[len(FOLDER) :]) for n in names if n.startswith(FOLDER)))
 
-    def keys(self, serial: str) -> frozenset[str]:
-        """Return the keys of a robot's rows."""
-        names = self._names(self._folder(serial))
-        return frozenset(n[: -len(ENDING)] for n in names if n.endswith(ENDING) and n[0] != '.')
-
     def rows(self, serial: str) -> tuple[Row, ...]:
         """Return the rows of a robot, ordered by time."""
         import pyarrow as pa
 
-        keys = self.keys(serial)
+        names = self._names(self._folder(serial))
+        keys = {n[: -len(ENDING)] for n in names if n.endswith(ENDING) and n[0] != '.'}
         known = self._cached(serial)
         held = known.column('key').to_pylist()
         new = sorted(keys.difference(held))

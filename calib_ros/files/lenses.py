@@ -62,11 +62,7 @@ def _require_size(path: Path, content: Mapping[str, Any], found: Detections) -> 
 
 
 def lens_of(
-    model: str,
-    matrix: Sequence[float],
-    distortion: Sequence[float],
-    where: str,
-    fitted: bool = False,
+    model: str, matrix: Sequence[float], distortion: Sequence[float], where: str, fitted: bool
 ) -> Lens:
     """Return the lens of a camera matrix (9), row by row, and its distortion k1 k2 p1 p2 k3.
 

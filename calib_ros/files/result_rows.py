@@ -26,13 +26,11 @@ def result_row(result: Identification, about: Filing, warnings: Sequence[str] = 
     names = tuple(map(str, result.names))
     which = result.validation or result.fitted
     freedom = result.uncertainty.overall
-    return _row(
-        about,
-        'identify',
-        result.chain,
-        'accepted' if result.accepted else 'refused',
-        which.figures,
-        interval_of(which, 1),
+    return Row(
+        **asdict(about),
+        **_judged(result.chain, which.figures, interval_of(which, 1)),
+        kind='identify',
+        verdict='accepted' if result.accepted else 'refused',
         reasons=tuple(map(str, result.refusals)),
         remarks=tuple(map(str, (*warnings, *result.remarks))),
         freedom=freedom if np.isfinite(freedom) else None,
@@ -40,7 +38,7 @@ def result_row(result: Identification, about: Filing, warnings: Sequence[str] = 
         offsets=np.array([offsets[name] for name in names]),
         covariance=result.covariance,
         tilt=result.posterior.unmodelled.waves,
-        tilts=np.float32(result.posterior.unmodelled.followed),
+        tilts=np.asarray(result.posterior.unmodelled.followed, dtype='f4'),
     )
 
 
@@ -50,29 +48,18 @@ def verification_row(chain: Chain, found: Judgement, about: Filing, kind: str = 
     figures = before, replace(after, rms_mm=1e3 * found.rms)
     limits = found.lower, found.upper
     freedom = None if found.reused or found.mistake else found.freedom
-    return _row(about, kind, chain, found.verdict, figures, limits, rms_freedom=freedom)
+    more = _judged(chain, figures, limits)
+    return Row(**asdict(about), **more, kind=kind, verdict=found.verdict, rms_freedom=freedom)
 
 
-def _row(
-    about: Filing,
-    kind: str,
-    chain: Chain,
-    verdict: str,
-    figures: tuple[ErrorFigures, ErrorFigures],
-    limits: tuple[float, float],
-    **more: Any,
-) -> Row:
+def _judged(
+    chain: Chain, figures: tuple[ErrorFigures, ErrorFigures], limits: tuple[float, float]
+) -> dict[str, Any]:
+    """Return the columns of an arm, and of its errors before and after with their interval [m]."""
     before, after = figures
-    more |= {name: getattr(after, name) for name in ('rms_mm', 'mean_mm', 'max_mm', 'rms_mrad')}
+    found: dict[str, Any] = {'model': chain.name, 'chain': json.dumps(chain_document(chain))}
+    found |= {'poses': after.count, 'rms_before_mm': before.rms_mm}
+    found |= {name: getattr(after, name) for name in ('rms_mm', 'mean_mm', 'max_mm', 'rms_mrad')}
     if np.isfinite(limits).all():
-        more |= {'lower_mm': 1e3 * limits[0], 'upper_mm': 1e3 * limits[1]}
-    return Row(
-        **asdict(about),
-        kind=kind,
-        model=chain.name,
-        chain=json.dumps(chain_document(chain)),
-        verdict=verdict,
-        poses=after.count,
-        rms_before_mm=before.rms_mm,
-        **more,
-    )
+        found |= {'lower_mm': 1e3 * limits[0], 'upper_mm': 1e3 * limits[1]}
+    return found

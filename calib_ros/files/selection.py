@@ -6,15 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.files.columns import Codes, Columns
+from calib_ros.files.columns import Columns
 from calib_ros.files.measurements import Measurements, measurements
 from calib_ros.files.vocabulary import POSITION
-from calib_ros.kinematics.se3 import Index
 
 
 def without_others(found: Columns) -> tuple[Columns, tuple[str, ...]]:
@@ -46,24 +44,20 @@ def select_rows(found: Columns, joints: int, sessions: Sequence[str]) -> Measure
     if 'session' not in found.cells and sessions:
         names = ', '.join(sessions)
         raise InputError(f'{found.path} has no column "session" to choose "{names}" from')
-    rows = _rows_of(found.path, found.labels('session'), sessions)
-    every = np.array_equal(rows, np.arange(len(found.lines)))
-    return measurements(found if every else found.select(rows), joints)
-
-
-def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> Index:
-    numbers, known = labels
+    numbers, known = found.labels('session')
     if not sessions and len(known) > 1:
         named = ', '.join(filter(None, known))
         blank = '; rows without one are left out: name it in each (merged cells: in the first)'
         raise InputError(
-            f'{path} holds several sessions, choose one of {named} (or several, joined by commas, '
-            f'to fit them together){blank * ("" in known)}'
+            f'{found.path} holds several sessions, choose one of {named} (or several, joined by '
+            f'commas, to fit them together){blank * ("" in known)}'
         )
     for k, name in enumerate(sessions):
         if name in sessions[:k]:
             raise InputError(f'session "{name}" is named twice')
         if name not in known:
-            raise UnknownNameError(f'session in {path}', name, known)
+            raise UnknownNameError(f'session in {found.path}', name, known)
     wanted = [known.index(name) for name in sessions or known]
-    return np.concatenate([np.flatnonzero(numbers == place) for place in wanted])
+    rows = np.concatenate([np.flatnonzero(numbers == place) for place in wanted])
+    every = np.array_equal(rows, np.arange(len(found.lines)))
+    return measurements(found if every else found.select(rows), joints)

@@ -65,9 +65,8 @@ def read_table(
         read = of_journal(path, joints, progress)
     found, warnings = read or _of_csv(path, joints, progress)
     found, more = without_others(found)
-    warnings = (*warnings, *more)
-    rows, by_line = select_rows(found, joints, sessions), 'stamp_ns' not in found.cells
-    return _dataset(rows, sigmas, eye_in_hand, warnings, by_line)
+    made = _dataset(select_rows(found, joints, sessions), sigmas, eye_in_hand)
+    return replace(made, warnings=(*warnings, *more), by_line='stamp_ns' not in found.cells)
 
 
 def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[str, ...]]:
@@ -104,13 +103,7 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
     return kept, (*notes, *not_read(path, [name for name in cells if name not in known]))
 
 
-def _dataset(
-    made: Measurements,
-    sigmas: tuple[float, float] = USUAL_SIGMAS,
-    eye_in_hand: bool = False,
-    warnings: tuple[str, ...] = (),
-    by_line: bool = False,
-) -> Dataset:
+def _dataset(made: Measurements, sigmas: tuple[float, float], eye_in_hand: bool) -> Dataset:
     made = made.kept()
     made.check_frames()
     if eye_in_hand:
@@ -127,8 +120,7 @@ def _dataset(
 
         found = dataset_of([*examples.samples()], sigmas, columns=columns_of_set)
     place, names = made.frame_id
-    world_frame = next((names[k] for k in place.tolist() if names[k]), '')
-    return replace(found, world_frame=world_frame, warnings=warnings, by_line=by_line)
+    return replace(found, world_frame=next((names[k] for k in place.tolist() if names[k]), ''))
 
 
 def check_table(made: Columns) -> None:
@@ -144,4 +136,4 @@ def check_table(made: Columns) -> None:
         )
     sessions = made.texts('session') if 'session' in made.cells else ()
     made, _ = without_others(made)
-    _dataset(select_rows(made, joints, tuple(dict.fromkeys(sessions))))
+    _dataset(select_rows(made, joints, tuple(dict.fromkeys(sessions))), USUAL_SIGMAS, False)

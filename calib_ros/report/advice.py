@@ -101,19 +101,18 @@ class Situation:
 
     def first_of(self, rule: Rule) -> tuple[str, ...]:
         """Return what to do before the steps of a rule."""
-        rounded = rule in {*UNSURE, Rule.LARGEST_ERROR} and self.rounding
-        return (*[DIGITS.format(self.rounding)] * bool(rounded), *self._first_of(rule))
-
-    def _first_of(self, rule: Rule) -> tuple[str, ...]:
+        found = []
+        if rule in {*UNSURE, Rule.LARGEST_ERROR} and self.rounding:
+            found.append(DIGITS.format(self.rounding))
         if rule in {Rule.GAIN, Rule.LARGEST_ERROR} and self.contradicted:
-            return (IN_BETWEEN,)
-        if rule is Rule.LARGEST_ERROR and self.outliers:
-            return (OUTLYING.format(self.outliers),)
-        if rule is Rule.GAIN and self.drifts:
-            return (DRIFTS,)
-        if rule is Rule.REGION and self.sigma and self.left * ALIKE < 1.0:
-            return (FINER.format(1e3 * self.sigma, 1e3 * self.left * self.sigma),)
-        return ()
+            found.append(IN_BETWEEN)
+        elif rule is Rule.LARGEST_ERROR and self.outliers:
+            found.append(OUTLYING.format(self.outliers))
+        elif rule is Rule.GAIN and self.drifts:
+            found.append(DRIFTS)
+        elif rule is Rule.REGION and self.sigma and self.left * ALIKE < 1.0:
+            found.append(FINER.format(1e3 * self.sigma, 1e3 * self.left * self.sigma))
+        return tuple(found)
 
     def said_of(self, one: Advice) -> Advice:
         """Return the advice on an unproven correction that suits the situation."""

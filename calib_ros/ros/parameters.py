@@ -61,7 +61,8 @@ def declare_all(node: Node, shared: Collection[str]) -> tuple[NodeValues, Sequen
     for name in overrides:
         node.undeclare_parameter(name)
     own = {n: _declare(node, overrides, p) for n, p in PARAMETERS.items() if n not in OF_ROS}
-    strange = [each for each in overrides if each in shared and not _is_ours(each)]
+    others = [n for n in overrides if n in shared and not (n.startswith(QOS) or n in PARAMETERS)]
+    strange = [name for name in others if not near(name, PARAMETERS, 0.8)]  # no typing errors
     if strange:
         told = f'parameters of all nodes that this one does not have: {", ".join(some(strange))}'
         node.get_logger().warning(f'{told}: they are ignored')
@@ -78,11 +79,6 @@ def declare_all(node: Node, shared: Collection[str]) -> tuple[NodeValues, Sequen
     if own['socket']:
         socket_place(own['socket'])
     return NodeValues(**own, settings=settings), [*overrides]
-
-
-def _is_ours(name: str) -> bool:
-    """Tell whether a parameter is one of the node's, or looks like one with an error."""
-    return name.startswith(QOS) or name in PARAMETERS or bool(near(name, PARAMETERS, 0.8))
 
 
 def changed(settings: Settings, changes: Sequence[Any]) -> Settings:

@@ -54,14 +54,6 @@ def check_settings(chain: Chain, settings: Settings) -> None:
     Problem(chain, empty, **settings.for_problem())
 
 
-def with_lenses(chain: Chain, found: Mapping[str, Lens]) -> Chain:
-    """Return a chain with lenses at its frames."""
-    for name, lens in found.items():
-        frame = chain.frame(name) if name in chain.frame_names else Frame()
-        chain = chain.with_frame(name, replace(frame, lens=lens))
-    return chain
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Dataset(Shown):
     """The sets to fit and held out, each with its own frames."""
@@ -85,8 +77,11 @@ class Dataset(Shown):
                 'the table has no rows to fit, only rows marked test in its column split'
             )
         settings = settings or Settings()
+        for name, lens in self.lenses.items():
+            frame = chain.frame(name) if name in chain.frame_names else Frame()
+            chain = chain.with_frame(name, replace(frame, lens=lens))
         return Problem(
-            with_lenses(chain, self.lenses),
+            chain,
             self.fitted[0],
             self.held_out,
             more=self.fitted[1:],

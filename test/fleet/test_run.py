@@ -46,7 +46,7 @@ def echoed(task):
 
 
 def keys(history):
-    return {(each, key) for each in history.serials() for key in history.keys(each)}
+    return {(each, row.key) for each in history.serials() for row in history.rows(each)}
 
 
 def test_what_is_new_is_done_and_filed_once(plant, cluster, tmp_path):
