@@ -95,11 +95,7 @@ class Shown:
 
     def _repr_html_(self) -> str:
         """Return the fields in brief as a table, for notebooks."""
-        rows = (
-            f'<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>'
-            for name, value in _briefly(self)
-        )
-        return f'<table><caption>{type(self).__name__}</caption>{"".join(rows)}</table>'
+        return as_html(type(self).__name__, (), (('field', 'value'), *_briefly(self)))
 
 
 def as_html(caption: str, text: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
