@@ -57,14 +57,10 @@ def at_least(options: argparse.Namespace, **lowest: float) -> None:
             raise InputError(f'--{name} must be at least {least}, not {value}')
 
 
-def check_loss(options: argparse.Namespace) -> None:
-    """Refuse a largest loss that is no share."""
+def check_acceptance(options: argparse.Namespace) -> None:
+    """Refuse a largest loss that is no share, and a tolerance in another unit than mm."""
     if not 0.0 <= options.largest_loss <= 1.0:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
-
-
-def check_tolerance(options: argparse.Namespace) -> None:
-    """Refuse a tolerance in another unit than mm."""
     if options.tolerance is not None and not 0.0 < options.tolerance <= 100.0:
         raise InputError(f'--tolerance must be between 0 and 100 mm, not {options.tolerance:g} mm')
 

@@ -9,7 +9,7 @@ import argparse
 import numpy as np
 
 from calib_ros.atomic import write_file
-from calib_ros.cli import checks, common, inputs
+from calib_ros.cli import checks, inputs
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -21,7 +21,6 @@ from calib_ros.files.layouts import Layout
 from calib_ros.files.recording import Recording, write_bag
 from calib_ros.files.tables import check_table
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.settings import Settings
 
 
 def _convert(options: argparse.Namespace, screen: Screen) -> int:
@@ -44,7 +43,7 @@ def _convert(options: argparse.Namespace, screen: Screen) -> int:
 def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.csv, 'csv2bag', 'table')
     chain = load_chain(options.chain)
-    table = inputs.table_of(options, options.csv, chain, Settings(), screen)
+    table = inputs.table_of(options, options.csv, chain, screen)
     for warning in table.warnings:
         screen.warn(warning)
     every = [*table.fitted, *table.held_out]
@@ -85,7 +84,7 @@ def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.bag, 'bag2csv', 'bag')
     checks.refuse_existing(options, options.csv)
     chain = load_chain(options.chain)
-    session, read = inputs.replayed_bag(options.bag, chain, common.settings_of(options), screen)
+    session, read = inputs.replayed_bag(options, options.bag, chain, screen)
     screen.say(f'{read}; {session.account()}')
     samples = session.usable
     if not samples:

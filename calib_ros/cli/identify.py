@@ -7,8 +7,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from calib_ros.cli import checks, common, inputs
 from calib_ros.cli.file_types import refuse_others
@@ -21,7 +21,7 @@ from calib_ros.estimation.observations import frames_of_sets
 from calib_ros.files import boards, detections, image_places
 from calib_ros.files.lenses import read_lens
 from calib_ros.files.loading import Loaded, load_bag, load_table
-from calib_ros.files.result_rows import result_row as row_of
+from calib_ros.files.result_rows import result_row
 from calib_ros.identification.age import refuse_older, years_since
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.identification.recalibrated import Recalibration
@@ -37,7 +37,7 @@ from calib_ros.report.gathered import poses_of, poses_to_verify
 from calib_ros.report.markdown import markdown
 from calib_ros.report.refusals import Advice
 from calib_ros.sampling.dataset import Dataset
-from calib_ros.settings import Settings, refuse_larger
+from calib_ros.settings import refuse_larger
 from calib_ros.shown import of_them, rounded
 from calib_ros.texts import dump_json
 
@@ -49,18 +49,17 @@ NOT_OF_UPDATES = ('history', 'tolerance', 'model', 'fixed', 'priors', 'folds')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    checks.check_tolerance(options)
-    checks.check_loss(options)
+    checks.check_acceptance(options)
     if options.previous is not None:
         checks.refuse(options, NOT_OF_UPDATES, 'does not apply to --previous')
         return _recalibrated(options, screen)
-    filed = inputs.history_of(options)
+    file = inputs.filer_of(options)
     with common.output_files(options, (*RESULT_FILES, 'report.pdf')) as contents:
         loaded = _loaded(options, screen)
         read = (options.csv, options.detections, options.measured)
-        found = replace(identified(options, screen, loaded, *read), tolerance=options.tolerance)
+        found = identified(options, screen, loaded, *read)
         if options.out is not None:
-            contents |= result_files(found, screen, options.out, options.pdf)
+            contents |= result_files(found, options, screen)
     shown = () if found.result.accepted and not options.json else words.other_remarks(found.result)
     for warning in (*found.loaded.warnings, *shown):
         screen.warn(warning)
@@ -73,11 +72,9 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             screen.bullet(f'nothing was saved: --out FOLDER writes {made}')
         else:
             screen.say(common.written(options.out, contents))
-    if filed is not None:  # last: a full disk there must not hide the result
-        (history, unread), problem = filed, found.loaded.problem
-        judged_by = options.largest_loss
-        about = inputs.filing_of(options, problem.chain, problem.all_sets, unread, judged_by)
-        history.file(row_of(found.result, about, found.loaded.warnings))
+    # last: a full disk there must not hide the result
+    row, problem = partial(result_row, found.result, warnings=loaded.warnings), loaded.problem
+    file(row, problem.chain, problem.all_sets, options.largest_loss)
     return 0 if found.result.accepted else common.Status.NOT_ACCEPTED
 
 
@@ -133,7 +130,7 @@ def _update_files(
     origin = inputs.origin_of(options, read, serial=serial)
     report = update.update_report(found, poses, origin, loaded.warnings)
     contents |= {'residuals.csv': poses.table(), 'report.md': markdown(report, {})}
-    return contents | inputs.page_of(report, screen, pdf=options.pdf)
+    return contents | inputs.page_of(options, report, screen)
 
 
 def _show_update(found: Recalibration, screen: Screen) -> None:
@@ -169,23 +166,20 @@ def identified(
     origin = inputs.origin_of(options, read, settings=configuration)
     with screen.work('identifying') as work:
         result = loaded.identified(settings.model, work)
-    return Identified(loaded, result, origin)
+    return Identified(loaded, result, origin, vars(options).get('tolerance'))
 
 
 def _loaded(options: argparse.Namespace, screen: Screen) -> Loaded:
     source = _source(options)
     posed = options.chain == image_places.POSED
     chain = image_places.posed_arm() if posed else load_chain(options.chain)
-    settings = common.settings_of(options)
-    touch = options.sigma_touch
-    refuse_larger('sigma_touch', touch or 0.0, TOUCH_SIGMA)
-    touched: dict[str, Any] = {} if touch is None else {'sigma_touch': touch}
+    refuse_larger('sigma_touch', options.sigma_touch or 0.0, TOUCH_SIGMA)
     if options.detections is not None:
-        return _detected(options, chain, settings, touched, screen)
+        return _detected(options, chain, screen)
     if source == 'table':
-        found = inputs.table_of(options, options.csv, chain, settings, screen, options.eye_in_hand)
-        return load_table(found, chain, settings, **touched)
-    bag = inputs.replayed_bag(options.measured, chain, settings, screen)
+        found = inputs.table_of(options, options.csv, chain, screen)
+        return load_table(found, chain, common.settings_of(options), options.sigma_touch)
+    bag = inputs.replayed_bag(options, options.measured, chain, screen)
     return load_bag(*bag, options.largest_loss)
 
 
@@ -202,13 +196,7 @@ def _source(options: argparse.Namespace) -> str:
     return source
 
 
-def _detected(
-    options: argparse.Namespace,
-    chain: Chain,
-    settings: Settings,
-    touched: dict[str, Any],
-    screen: Screen,
-) -> Loaded:
+def _detected(options: argparse.Namespace, chain: Chain, screen: Screen) -> Loaded:
     for name in ('board', 'places'):
         if getattr(options, name) is None:
             raise InputError(f'--detections needs --{name}')
@@ -223,7 +211,7 @@ def _detected(
     seen, notes = detections.observed(found, board, places, options.eye_in_hand)
     rows = Dataset((), by_line=True)
     if options.csv is not None:
-        rows = inputs.table_of(options, options.csv, chain, settings, screen)
+        rows = inputs.table_of(options, options.csv, chain, screen)
         names = ('base_board', 'tool_camera') if seen.on_flange else ('base_camera', 'tool_board')
         seen = replace(seen, base=names[0], tool=names[1])
     known = chain.frame(seen.camera).lens if seen.camera in chain.frame_names else None
@@ -233,10 +221,11 @@ def _detected(
     lenses = {} if lens is None else {seen.camera: replace(lens, fixed=not fitted)}
     warnings = (*left_out, *notes, *rows.warnings)
     rows = replace(rows, fitted=(seen, *rows.fitted), lenses=lenses, warnings=warnings)
+    settings = common.settings_of(options)
     if posed:
         joints = (f'{name}.*' for name in chain.joint_names)
         settings = replace(settings, fixed=(*settings.fixed, *joints))
-    loaded = load_table(rows, chain, settings, **touched)
+    loaded = load_table(rows, chain, settings, options.sigma_touch)
     reason = 'joint values are not known, so the arm was not fitted: only what follows'
     refusals = (Reason(Rule.POSED, reason),) if posed else ()
     samples = loaded.samples | {'images': len(found.names)}
@@ -246,17 +235,12 @@ def _detected(
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """A result with its input and origin; the wanted error [mm] if given."""
+    """A result with its input and origin, and the wanted error [mm] if given."""
 
     loaded: Loaded
     result: Identification
     origin: Origin
     tolerance: float | None = None
-
-    @property
-    def wanted(self) -> float | None:
-        """Return the wanted error [m]."""
-        return None if self.tolerance is None else 1e-3 * self.tolerance
 
 
 def show(found: Identified, screen: Screen) -> None:
@@ -265,7 +249,7 @@ def show(found: Identified, screen: Screen) -> None:
     if found.loaded.read:
         screen.say(found.loaded.read)
     reasons = advice_of(found.loaded.problem, result)
-    verdict = reports.result_standing(result, reasons, found.wanted)
+    verdict = reports.result_standing(result, reasons, found.tolerance)
     screen.title(verdict.heading, GOOD_OR_BAD.get(verdict.state))
     screen.table(_rows(result))
     _explain(result, reasons, screen)
@@ -325,39 +309,39 @@ def _document(found: Identified) -> str:
 
 
 def result_files(
-    found: Identified, screen: Screen, out: Path, pdf: bool = False
-) -> dict[str, str | bytes]:
+    found: Identified, options: argparse.Namespace, screen: Screen
+) -> common.Contents:
     """Return the files of a result by name; a chain only if accepted.
 
-    If this result is not, a chain accepted earlier in `out` is renamed: it no longer belongs to
+    If this result is not, a chain accepted earlier in --out is renamed: it no longer belongs to
     the files beside it.
     """
     from calib_ros.report.plots import before_after_png
 
-    loaded, result = found.loaded, found.result
+    loaded, result, origin = found.loaded, found.result, found.origin
     with screen.work('writing the report') as work:
         work('residuals.csv, 1 of 3')
         poses = poses_of(loaded.problem, result, loaded.by_line, loaded.images)
-        contents: dict[str, str | bytes] = {
+        contents: common.Contents = {
             'result.json': _document(found) + '\n',
             'residuals.csv': poses.table(share_of(work, 0.0, 1 / 3)),
-            'settings.yaml': found.origin.settings,
+            'settings.yaml': origin.settings,
         }
         work('before_after.png, 2 of 3')
         contents['before_after.png'] = before_after_png(result)
         work('report.html, 3 of 3')
         work(2 / 3)
-        report = reports.identification_report(loaded, result, found.origin, found.wanted, poses)
+        report = reports.identification_report(loaded, result, origin, found.tolerance, poses)
         contents['report.md'] = markdown(report, loaded.samples)
-        contents |= inputs.page_of(report, screen, pdf=pdf)
+        contents |= inputs.page_of(options, report, screen)
     if result.accepted:
         # the only device and target of a table may be any of a bag or node
         owners = loaded.owners if loaded.read or len(loaded.owners) > 2 else {}
-        serial = {'robot_serial': found.origin.serial} if found.origin.serial else {}
+        serial = {'robot_serial': origin.serial} if origin.serial else {}
         kept = Calibration.of(result, serial, owners, loaded.problem.sets)
         contents['calibration.yaml'] = kept.dump()
         return contents
-    return contents | _set_aside(out)
+    return contents | _set_aside(options.out)
 
 
 def _set_aside(out: Path, previous: Path | None = None) -> dict[str, bytes]:

@@ -78,7 +78,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         page = _page_beside(options.out)
         origin = inputs.origin_of(options, (options.candidates, options.task, options.taken))
         report = plan_report(design.chain, joints, remarks, origin, plan, options.accuracy)
-        pages = inputs.page_of(report, screen, page.name)
+        pages = inputs.page_of(options, report, screen, page.name)
         beside = {options.out.with_name(name): text for name, text in pages.items()}
         write_together({options.out: joints_csv(joints), **beside}, overwrite=options.force)
         screen.say(f'wrote {options.out}' + (f' and {page}' if pages else ''))

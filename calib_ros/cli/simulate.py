@@ -20,7 +20,6 @@ from calib_ros.files.recording import Recording, write_bag
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import chain_text, dump_chain, load_chain, parse_chain
 from calib_ros.report import words
-from calib_ros.settings import Settings
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -38,11 +37,11 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         screen.say(f'1. simulating an arm with known errors: {options.out / "bag"}')
         truth = _write_simulation(chain, options, bag, screen)
         screen.say('2. reading the recording as if from a real cell')
-        loaded = load_bag(*inputs.replayed_bag(bag, chain, Settings(), screen))
+        loaded = load_bag(*inputs.replayed_bag(options, bag, chain, screen))
         screen.say('3. identifying the errors')
         found = identified(options, screen, loaded, bag)
         screen.say('4. writing the report')
-        contents = result_files(found, screen, options.out)
+        contents = result_files(found, options, screen)
         write_files(folder, contents)
         against = words.against_truth(found.result, parse_chain(chain_text(truth)))
     screen.say('identified offsets against the true ones [mm, mrad]:')

@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 from calib_ros.apply.verification import verify
 from calib_ros.apply.verified import Verification
@@ -16,10 +16,9 @@ from calib_ros.cli.screen import GOOD_OR_BAD, Screen
 from calib_ros.decision.reasons import Rule
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import ALIKE
-from calib_ros.estimation.observations import Observations
 from calib_ros.files.programs import read_joints
 from calib_ros.files.result_rows import verification_row
-from calib_ros.identification.calibration import Calibration, calibration_file
+from calib_ros.identification.calibration import calibration_file
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
@@ -30,7 +29,7 @@ from calib_ros.report.remarks import each_in_words, likely_rms, not_steps, remar
 from calib_ros.report.standing import standing
 from calib_ros.report.verdicts import verification_report
 from calib_ros.report.words import rms_change
-from calib_ros.sampling.dataset import dataset_of
+from calib_ros.sampling.dataset import Dataset, dataset_of
 from calib_ros.shown import rounded
 from calib_ros.texts import dump_json
 
@@ -39,61 +38,46 @@ VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     screen.quiet = screen.quiet or options.json
-    checks.check_loss(options)
-    checks.check_tolerance(options)
+    checks.check_acceptance(options)
     with common.output_files(options, VERIFICATION_FILES) as contents:
-        status, file = _verified(options, screen, contents)
+        file = inputs.filer_of(options)
+        nominal = load_chain(options.chain)
+        arm = inputs.calibration_of(options.calibration, 'verify --calibration', nominal)
+        serial = arm.serial_of(str(options.calibration), options.serial)
+        read = _read(options, nominal, screen)
+        names = arm.frames_of(read.owners)
+        sets = [each.between(names) for each in (*read.fitted, *read.held_out)]
+        commanded = read_joints(options.commanded, nominal) if options.commanded else None
+        tolerance = None if options.tolerance is None else 1e-3 * options.tolerance
+        confidence, moved = options.confidence, (options.new_base, options.new_tool)
+        sigma = vars(options).get('sigma_position')
+        with screen.work('judging') as work:
+            given = confidence, moved[0], commanded, moved[1], work, sigma
+            found = verify(arm, sets, tolerance, *given)
+        for warning in read.warnings:
+            screen.warn(warning)
+        if options.json:
+            screen.data(dump_json(verification_document(found)))
+        else:
+            show(found, screen)
+        if options.out is not None:
+            files = (options.measured, options.commanded, calibration_file(options.calibration))
+            with screen.work('writing the report') as work:
+                poses = poses_to_verify(found.chain, sets, found.comparison, read.by_line)
+                origin = inputs.origin_of(options, files, serial=serial)
+                report = verification_report(arm.chain, found, poses, origin, read.warnings)
+                contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
+                contents['report.md'] = markdown(report, {})
+                contents |= inputs.page_of(options, report, screen)
     if options.out is not None:
         screen.say(common.written(options.out, contents))
-    file()  # last: a full disk there must not hide the verdict
-    return status
-
-
-def _verified(
-    options: argparse.Namespace, screen: Screen, contents: common.Contents
-) -> tuple[int, Callable[[], object]]:
-    """Print a verdict and add its files; return the status, and what files it in the history."""
-    filed = inputs.history_of(options)
-    nominal = load_chain(options.chain)
-    arm = inputs.calibration_of(options.calibration, 'verify --calibration', nominal)
-    serial = arm.serial_of(str(options.calibration), options.serial)
-    sets, warnings, by_line = _sets(options, nominal, arm, screen)
-    commanded = read_joints(options.commanded, nominal) if options.commanded else None
-    tolerance = None if options.tolerance is None else 1e-3 * options.tolerance
-    confidence, moved = options.confidence, (options.new_base, options.new_tool)
-    sigma = vars(options).get('sigma_position')
-    with screen.work('judging') as work:
-        given = confidence, moved[0], commanded, moved[1], work, sigma
-        found = verify(arm, sets, tolerance, *given)
-
-    def file() -> None:
-        if filed is not None:
-            history, unread = filed
-            wanted = None if commanded is None else commanded.tolist()
-            judged_by = (table_hash(arm.chain), options.tolerance, confidence, *moved, wanted)
-            stated = [] if sigma is None else [sigma]  # the settings have its default, too
-            about = inputs.filing_of(options, nominal, sets, unread, *judged_by, *stated)
-            history.file(verification_row(arm.chain, found, about))
-
-    for warning in warnings:
-        screen.warn(warning)
-    if options.json:
-        screen.data(dump_json(verification_document(found)))
-    else:
-        show(found, screen)
+    wanted = None if commanded is None else commanded.tolist()
+    judged_by = (table_hash(arm.chain), options.tolerance, confidence, *moved, wanted)
+    stated = [] if sigma is None else [sigma]  # the settings have its default, too
+    # last: a full disk there must not hide the verdict
+    file(partial(verification_row, arm.chain, found), nominal, sets, *judged_by, *stated)
     passed = standing(found)[0].state not in ('bad', 'open')
-    status = 0 if passed else common.Status.NOT_ACCEPTED
-    if options.out is None:
-        return status, file
-    read = (options.measured, options.commanded, calibration_file(options.calibration))
-    with screen.work('writing the report') as work:
-        poses = poses_to_verify(found.chain, sets, found.comparison, by_line)
-        origin = inputs.origin_of(options, read, serial=serial)
-        report = verification_report(arm.chain, found, poses, origin, warnings)
-        contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
-        contents['report.md'] = markdown(report, {})
-        contents |= inputs.page_of(report, screen, pdf=options.pdf)
-    return status, file
+    return 0 if passed else common.Status.NOT_ACCEPTED
 
 
 def show(found: Verification, screen: Screen) -> None:
@@ -130,27 +114,20 @@ def show(found: Verification, screen: Screen) -> None:
         screen.bullet('what to do:', steps)
 
 
-def _sets(
-    options: argparse.Namespace, nominal: Chain, arm: Calibration, screen: Screen
-) -> tuple[Sequence[Observations], tuple[str, ...], bool]:
-    """Return the sets between the calibration's frames of their devices and targets."""
-    settings = common.settings_of(options)
+def _read(options: argparse.Namespace, nominal: Chain, screen: Screen) -> Dataset:
+    """Return the measurements of a table or bag; refuse a bag of which much is lost."""
     kind = refuse_others(options.measured, 'verify', 'table', 'bag')
     checks.refuse_ignored(options, kind)
     if kind == 'table':
-        given = options.measured, nominal, settings, screen, options.eye_in_hand
-        found = inputs.table_of(options, *given)
-    else:
-        session, read = inputs.replayed_bag(options.measured, nominal, settings, screen)
-        screen.say(f'{read}; {session.account()}')
-        if not session.usable:
-            raise InputError(f'{options.measured} gives no poses: {session.account()}')
-        if lost := read.refusals(session.account(), options.largest_loss):
-            told = '; '.join((*read.warnings, *lost))
-            if lost[0].rule is not Rule.DROPPED:
-                told += '. First copy the bag again from the computer that made it'
-            raise InputError(told)
-        found = replace(dataset_of(session.usable, settings.sigmas), warnings=read.warnings)
-    names = arm.frames_of(found.owners)
-    sets = [each.between(names) for each in (*found.fitted, *found.held_out)]
-    return sets, found.warnings, found.by_line
+        return inputs.table_of(options, options.measured, nominal, screen)
+    session, read = inputs.replayed_bag(options, options.measured, nominal, screen)
+    screen.say(f'{read}; {session.account()}')
+    if not session.usable:
+        raise InputError(f'{options.measured} gives no poses: {session.account()}')
+    if lost := read.refusals(session.account(), options.largest_loss):
+        told = '; '.join((*read.warnings, *lost))
+        if lost[0].rule is not Rule.DROPPED:
+            told += '. First copy the bag again from the computer that made it'
+        raise InputError(told)
+    found = dataset_of(session.usable, session.settings.sigmas)
+    return replace(found, warnings=read.warnings)

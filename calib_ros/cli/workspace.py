@@ -29,48 +29,42 @@ OF_PLACEMENT = ('region', 'aim', 'model', 'cells', 'turns')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.report import plots
+
     checks.at_least(options, poses=100, cells=1, turns=1, seed=0)
     if options.task is None and options.joint_box is None:
         checks.refuse(options, OF_PLACEMENT, 'needs --task or --joint-box')
     with common.output_files(options, WORKSPACE_FILES + PLACEMENT_FILES) as contents:
-        contents |= _files(options, screen)
+        arm = inputs.calibration_of(options.result, 'workspace', load_chain(options.chain))
+        rng = np.random.default_rng(options.seed)
+        task = _task(options, arm, rng)
+        with screen.work('mapping errors over the workspace'):
+            survey = workspace.survey(arm, options.poses, rng)
+            table = csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud)
+            contents |= {'workspace.csv': table, 'workspace.png': plots.workspace_png(survey)}
+        _show(survey, screen)
+        if arm.region is not None:
+            screen.bullet(f'The calibration is {arm.region.in_words()}.')
+        found = None
+        if task is not None:
+            region = None if options.region is None else np.reshape(options.region, (2, 3))
+            aim, model, where = options.aim, options.model, (region, options.cells, options.turns)
+            with screen.work('placing the task') as work:
+                found = placement.place(arm, task, aim, model, *where, progress=work)
+            screen.bullet(f'Expected {aim} error of the task, {model} model')
+            screen.bullet(placed_in_words(found))
+            rows = np.column_stack([found.positions, found.turns, found.errors])
+            contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), rows)
+            contents['placements.png'] = plots.placements_png(found)
+            contents['placed_task.csv'] = joints_csv(found.joints[found.best])
+        serial = arm.serial_of(str(options.result), options.serial)
+        origin = inputs.origin_of(options, (calibration_file(options.result),), serial=serial)
+        with screen.work('writing the report'):
+            report = workspace_report(arm, survey, origin, found)
+            contents['workspace.md'] = markdown(report, {})
+            contents |= inputs.page_of(options, report, screen)
     screen.say(common.written(options.out, contents))
     return 0
-
-
-def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
-    from calib_ros.report import plots
-
-    arm = inputs.calibration_of(options.result, 'workspace', load_chain(options.chain))
-    rng = np.random.default_rng(options.seed)
-    task = _task(options, arm, rng)
-    with screen.work('mapping errors over the workspace'):
-        survey = workspace.survey(arm, options.poses, rng)
-        contents: common.Contents = {
-            'workspace.csv': csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud),
-            'workspace.png': plots.workspace_png(survey),
-        }
-    _show(survey, screen)
-    if arm.region is not None:
-        screen.bullet(f'The calibration is {arm.region.in_words()}.')
-    found = None
-    if task is not None:
-        region = None if options.region is None else np.reshape(options.region, (2, 3))
-        with screen.work('placing the task') as work:
-            where = (region, options.cells, options.turns)
-            found = placement.place(arm, task, options.aim, options.model, *where, progress=work)
-        screen.bullet(f'Expected {options.aim} error of the task, {options.model} model')
-        screen.bullet(placed_in_words(found))
-        table = np.column_stack([found.positions, found.turns, found.errors])
-        contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
-        contents['placements.png'] = plots.placements_png(found)
-        contents['placed_task.csv'] = joints_csv(found.joints[found.best])
-    serial = arm.serial_of(str(options.result), options.serial)
-    origin = inputs.origin_of(options, (calibration_file(options.result),), serial=serial)
-    with screen.work('writing the report'):
-        report = workspace_report(arm, survey, origin, found)
-        contents['workspace.md'] = markdown(report, {})
-        return contents | inputs.page_of(report, screen)
 
 
 def _show(survey: Survey, screen: Screen) -> None:

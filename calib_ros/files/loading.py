@@ -105,8 +105,11 @@ def table(
     return read_table(*given, foreign, progress)
 
 
-def load_table(found: Dataset, chain: Chain, settings: Settings, **given: float) -> Loaded:
-    """Return the problem of a table, with `given` arguments."""
+def load_table(
+    found: Dataset, chain: Chain, settings: Settings, sigma_touch: float | None = None
+) -> Loaded:
+    """Return the problem of a table, with the sigma of touched planes [m] if not the usual one."""
+    given = {} if sigma_touch is None else {'sigma_touch': sigma_touch}
     problem = found.problem(chain, settings, **given)
     fitted, held_out = (sum(map(len, sets)) for sets in (found.fitted, found.held_out))
     samples = {'samples': fitted, 'held_out': held_out, 'sets': len(found.fitted)}

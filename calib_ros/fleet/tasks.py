@@ -91,6 +91,5 @@ def _outcome(task: Task, path: Path) -> Outcome:
         return Outcome(row)
     configuration = configuration_yaml(chain.name, settings)
     origin = Origin(inputs, serial=robot.serial, settings=configuration)
-    wanted = None if robot.tolerance is None else 1e-3 * robot.tolerance
-    report = identification_report(loaded, result, origin, wanted)
+    report = identification_report(loaded, result, origin, robot.tolerance)
     return Outcome(row, page=render(report, f'../../{PLOTLY}') or '')

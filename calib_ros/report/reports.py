@@ -54,14 +54,14 @@ def identification_report(
     loaded: Loaded,
     result: Identification,
     origin: Origin,
-    tolerance: float | None = None,
+    wanted_mm: float | None = None,
     poses: Poses | None = None,
 ) -> Report:
-    """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
+    """Return the report of an identification; `wanted_mm` is the wanted RMS error."""
     problem, judged = loaded.problem, result.validation or result.fitted
     poses = poses or poses_of(problem, result, loaded.by_line, loaded.images)
     reasons = advice_of(problem, result)
-    text = filter(None, _text(result, reasons, tolerance))
+    text = filter(None, _text(result, reasons, wanted_mm))
     shown = 2 if result.accepted else int(bool(_sound(reasons)))
     gain = sections.gain(judged, count=shown) if shown else ''
     fitted = [counted(result.rank, 'parameter')]
@@ -75,7 +75,7 @@ def identification_report(
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,
-        verdict=replace(result_standing(result, reasons, tolerance), text=tuple(text), gain=gain),
+        verdict=replace(result_standing(result, reasons, wanted_mm), text=tuple(text), gain=gain),
         advice=reasons,
         accuracy=sections.accuracy_section(
             'Accuracy before and after' if result.accepted else 'Accuracy of the correction tried',
@@ -85,11 +85,10 @@ def identification_report(
             f'"Before" is {words.BEFORE_IS}, so the gain comes from the arm alone.',
             'RMS (root mean square) is the typical error over poses like these.',
             *(f'Note: {note}.' for note in filter(None, (words.error_meaning(result),))),
-            with_outliers=judged.figures_of_all[1] if judged.outliers else None,
             intervals=result.validation is not None,
         ),
         picture=sections.distribution(poses),
-        steps=_steps(result, reasons, tolerance),
+        steps=_steps(result, reasons, wanted_mm),
         remarks=tuple(map(sentence, (*loaded.warnings, *notes))),
         identity=sections.identity_of(
             result.chain,
@@ -110,29 +109,29 @@ def identification_report(
 
 
 def result_standing(
-    result: Identification, reasons: Sequence[Advice], tolerance: float | None
+    result: Identification, reasons: Sequence[Advice], wanted_mm: float | None
 ) -> Headline:
     """Return the verdict as a reader sees it first: an arm without visible errors is not bad."""
     if result.accepted:
-        within, sure = _within(result.validation or result.fitted, tolerance)
+        within, sure = _within(result.validation or result.fitted, wanted_mm)
         open_yet = not sure or bool(result.remarks)
         whole = result.region is None or result.region.whole
         heading = f'Accepted{"" if whole else " near the measured poses"}{within}'
         heading += ': check first' * bool(result.remarks)
         return Headline('open' if open_yet else 'good', heading)
     if good := _sound(reasons):
-        within, _ = _within(result.validation or result.fitted, tolerance, 0)
+        within, _ = _within(result.validation or result.fitted, wanted_mm, 0)
         return Headline('info', f'{good}{within}: the robot stays as it was')
     return Headline('bad', 'Not accepted: the robot stays as it was')
 
 
 def _text(
-    result: Identification, reasons: Sequence[Advice], tolerance: float | None
+    result: Identification, reasons: Sequence[Advice], wanted_mm: float | None
 ) -> Iterator[str]:
     """Yield what is said below the verdict."""
     if result.accepted or _sound(reasons):
         how = 'Each pose is judged by a fit without it' if result.accepted else 'The arm as it is'
-        whole = ' The whole interval must be within the tolerance.' * (tolerance is not None)
+        whole = ' The whole interval must be within the tolerance.' * (wanted_mm is not None)
         yield f'{how}; 95 % interval in brackets.{whole}'
         if count := (result.validation or result.fitted).outliers:
             yield f'{counted(count, "outlier")}, listed below: not in these figures.'
@@ -161,12 +160,12 @@ def _sound(reasons: Sequence[Advice]) -> str:
     return next((each.sound for each in reasons if each.sound), '')
 
 
-def _within(judged: Comparison, tolerance: float | None, when: int = 1) -> tuple[str, bool]:
-    """Return in words and tell if the error before (0) or after is within a tolerance [m]."""
-    if tolerance is None:
+def _within(judged: Comparison, wanted_mm: float | None, when: int = 1) -> tuple[str, bool]:
+    """Return in words and tell if the error before (0) or after is within what is wanted."""
+    if wanted_mm is None:
         return '', True
-    wanted = f'within the tolerance of {1e3 * tolerance:g} mm RMS'
-    verdict = compared(tolerance, *interval_of(judged, when))
+    wanted = f'within the tolerance of {wanted_mm:g} mm RMS'
+    verdict = compared(1e-3 * wanted_mm, *interval_of(judged, when))
     if verdict == 'PASS':
         return f' and {wanted}', True
     return f', but {"" if verdict == "FAIL" else "perhaps "}not {wanted}', False
@@ -179,12 +178,12 @@ def may_be_closer(result: Identification, beyond: bool = False) -> bool:
 
 
 def _steps(
-    result: Identification, reasons: Sequence[Advice], tolerance: float | None
+    result: Identification, reasons: Sequence[Advice], wanted_mm: float | None
 ) -> tuple[str, ...]:
     if not result.accepted:
         return () if _sound(reasons) else (reasons[0].again,)
     interval = interval_of(result.validation or result.fitted, 1)
-    verdict = '' if tolerance is None else compared(tolerance, *interval)
+    verdict = '' if wanted_mm is None else compared(1e-3 * wanted_mm, *interval)
     whole = result.region is None or result.region.whole
     found = {
         'First check what is named above. If it is true, remove the cause and identify '

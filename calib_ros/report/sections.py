@@ -51,17 +51,16 @@ def accuracy_section(
     judged: Comparison,
     things: str,
     *text: str,
-    with_outliers: ErrorFigures | None = None,
     intervals: bool = True,
     error: str = ERROR,
 ) -> Section:
-    """Return the accuracy table, before and after; `things` are counted."""
+    """Return the accuracy table, before and after; `things` are counted, outliers apart."""
     columns = [
         _column(name, found, words.rms_range_mm(judged, when) if intervals else '')
         for when, (name, found) in enumerate(zip(('before', 'after'), judged.figures, strict=True))
     ]
-    if with_outliers is not None:
-        columns.append(_column('after, with outliers', with_outliers))
+    if judged.outliers:
+        columns.append(_column('after, with outliers', judged.figures_of_all[1]))
     labels = ('', things, *LABELS)
     head, *rows = (row for row in zip(labels, *columns, strict=True) if any(row[1:]))
     return section('accuracy', title, *text, error, head=head, rows=tuple(rows))

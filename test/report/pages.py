@@ -51,7 +51,8 @@ def problem_of(count=TRAIN, chain=UR, **more):
 
 
 def report_of(problem, result, warnings=(), tolerance=None):
-    return identification_report(Loaded(problem, {}, warnings), result, Origin(), tolerance)
+    wanted_mm = tolerance and 1e3 * tolerance
+    return identification_report(Loaded(problem, {}, warnings), result, Origin(), wanted_mm)
 
 
 def page_of(report):
