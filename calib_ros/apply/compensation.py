@@ -21,6 +21,7 @@ from calib_ros.annotated import as_annotated
 from calib_ros.apply.compensator import Compensation, Compensator
 from calib_ros.apply.refused import add_refusals, outside, too_fast, unreached
 from calib_ros.errors import InputError
+from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import LEVER
@@ -52,7 +53,7 @@ def compensate(
     follower = compensator.follower
     solution = follower.solve(command, approach, progress=progress)
     joints = np.clip(command + solution.change, follower.lower, follower.upper)  # rounding
-    result = Compensation(**vars(solution), command=command, joints=joints)
+    result = Compensation(**vars(solution), command=command, joints=joints, approach=approach)
     result = add_refusals(result, outside(compensator, result))
     result = add_refusals(result, unreached(compensator, result))
     moves, changes = (
@@ -99,3 +100,25 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
     if result.damped[kept].any():
         text += f'; {np.count_nonzero(result.damped[kept])} corrected in part'
     return text
+
+
+def knowledge(arm: Calibration, result: Compensation) -> tuple[str, str]:
+    """Return how well a calibration knows a corrected program's poses, and a warning.
+
+    Both texts are empty if there is nothing to say.
+    """
+    if arm.covariance is None:
+        return '', ''
+    parts = np.s_[:3], np.s_[3:]
+    shift, turn = (arm.sigma(result.joints, part, result.approach) for part in parts)
+    words = (
+        f'standard deviation of these poses: at most {rounded(1e3 * shift.max())} mm at the '
+        f'target measured and {rounded(1e3 * turn.max())} mrad'
+    )
+    if np.sum(turn**2) <= np.sum(result.orientation_before**2):
+        return words, ''
+    return words, (
+        'the calibration does not know the orientation well enough to correct it; positions '
+        'hold only near the measured target. Measure orientations too, or a target further '
+        'from the last axis'
+    )

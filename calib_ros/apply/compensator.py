@@ -75,6 +75,8 @@ class Compensation(Solution):
     """(N, n) joint values [rad or m] before correction."""
     joints: FloatArray
     """(N, n) the corrected ones; NaN in refused samples."""
+    approach: FloatArray | None = None
+    """(N, n) signs of the moves to these."""
     refusals: tuple[Refusal, ...] = ()
     """In the order of the samples."""
 

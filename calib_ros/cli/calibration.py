@@ -37,7 +37,7 @@ def _compare(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _compensate(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.apply.compensation import in_words
+    from calib_ros.apply.compensation import in_words, knowledge
     from calib_ros.apply.compensator import Compensator
     from calib_ros.apply.program import compensate_program
     from calib_ros.files.programs import program_of
@@ -67,7 +67,7 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
     write_file(options.out, text, overwrite=options.force)
     screen.say(f'wrote {options.out}: {in_words(compensator, result)}')
     screen.say(f'by {arm.whose}')
-    words, warning = arm.knowledge(result.joints, result.orientation_before)
+    words, warning = knowledge(arm, result)
     if words:
         screen.say(words)
     if warning:

@@ -45,14 +45,18 @@ class Region(Shown):
 
     def known(self, joints: FloatArray) -> FloatArray:
         """Return the expected error (N,) [m] by the parameters alone, compared with `limit`."""
-        return np.sqrt(self.variances(joints, np.s_[:3])[0])
+        return np.asarray(np.sqrt(self.variances(joints)[0]))
 
     def variances(
-        self, joints: FloatArray, part: slice, unmodelled: Unmodelled = NOTHING
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the variances (N,) of a part of poses by the parameters, and by the rest."""
+        self,
+        joints: FloatArray,
+        part: slice = np.s_[:3],
+        approach: FloatArray | None = None,
+        unmodelled: Unmodelled = NOTHING,
+    ) -> FloatArray:
+        """Return the variances (3, N) of a part of poses, as `Unmodelled.variances`."""
         model = ErrorModel(self.chain, self.names, self.base, self.tool)
-        return unmodelled.variances(model, self.square, joints, part)
+        return unmodelled.variances(model, self.square, joints, part, approach)
 
     def covers(self, joints: FloatArray) -> Flags:
         """Tell (N,) whether the calibration may be used at joint values (N, n)."""

@@ -120,27 +120,31 @@ class Identification(Shown):
         """Return the unidentifiable parameters that other poses would determine."""
         return tuple(p.name for p in self.parameters if p.status == 'not excited')
 
-    def pose_covariance(self, q: FloatArray) -> FloatArray:
+    def pose_covariance(self, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
         """Return the expected squares (N, 6, 6) [m, rad] of pose errors at q (N, n).
 
-        In world axes; due to the uncertainty of parameters and to unmodelled effects.
+        In world axes; due to the uncertainty of parameters and to unmodelled effects. `approach`
+        (N, n) holds the signs of the preceding moves; without it also due to fitted play.
         """
-        return self.posterior.expected(q)
+        return self.posterior.expected(q, approach=approach)
 
     @as_annotated
-    def confidence_ellipsoid(self, q: FloatArray, level: Share = CONFIDENT) -> FloatArray:
+    def confidence_ellipsoid(
+        self, q: FloatArray, level: Share = CONFIDENT, approach: FloatArray | None = None
+    ) -> FloatArray:
         """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position.
 
         By the F distribution if the noise was estimated, by chi-squared (its limit) if it is
-        given.
+        given; `approach` as in `pose_covariance`.
         """
-        jacobian = ErrorModel(self.chain, self.names).jacobian(q)[:, :3]
+        jacobian = ErrorModel(self.chain, self.names).jacobian(q, approach)[:, :3]
         sources = self.uncertainty.parts
         shares = np.array([np.einsum('ncp,pr,ncr->n', jacobian, s, jacobian) for s in sources])
         shares[-1] = 0.0  # waves: their size is hardly known
         freedom = self.uncertainty.freedom_of(shares)
-        posterior, squares = self.posterior, self.pose_covariance(q)[:, :3, :3]
-        biased = ErrorModel(posterior.chain, posterior.names).jacobian(q)[:, :3] @ posterior.shift
+        posterior, squares = self.posterior, self.pose_covariance(q, approach)[:, :3, :3]
+        model = ErrorModel(posterior.chain, posterior.names)
+        biased = model.jacobian(q, approach)[:, :3] @ posterior.shift
         even = np.eye(3) * ((biased**2).sum(axis=1) / 3.0)[:, np.newaxis, np.newaxis]
         squares = squares + even - biased[:, :, np.newaxis] * biased[:, np.newaxis]
         values, vectors = np.linalg.eigh(squares)

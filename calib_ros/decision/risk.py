@@ -60,7 +60,7 @@ def region_of(
     judge = _Judge(posterior, *ends, freedom)
     joints = np.concatenate([drawn, measured])
     rows, model = judge.rows(joints), ErrorModel(posterior.chain, posterior.names, *ends)
-    squares, _ = NOTHING.variances(model, posterior.square, joints, np.s_[:3])
+    squares, *_ = NOTHING.variances(model, posterior.square, joints, np.s_[:3])
     sizes = np.sqrt(np.maximum(squares, 0.0))  # of the expected errors
     sizes *= 1.0 + HALF_THE_DIGITS  # as rounded, also in the record
     far, limit = sizes[:SOME_POSES], float(sizes[SOME_POSES:].max())

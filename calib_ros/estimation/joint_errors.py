@@ -74,33 +74,47 @@ class Unmodelled(NamedTuple):
         """Return the expected squares (N, 6, 6) of pose errors [m, rad] at joint values (N, n).
 
         In world axes, with expected squares (P, P) of the model's parameters. `approach` (N, n)
-        holds the signs of the preceding moves; without it joints with play come from either side.
+        holds the signs of the preceding moves; without it joints come from either side, and are
+        off by their play.
         """
         known = _from_either_side(model, square) if approach is None else square
         found = [
-            own @ known @ np.swapaxes(own, 1, 2) + off @ np.swapaxes(off, 1, 2)
-            for own, off in self._seen(model, joints, approach)
+            own @ known @ np.swapaxes(own, 1, 2)
+            + sum(off @ np.swapaxes(off, 1, 2) for off in rest)
+            for own, *rest in self._seen(model, joints, approach)
         ]
         return np.concatenate(found)
 
     def variances(
-        self, model: ErrorModel, square: FloatArray, joints: FloatArray, part: slice
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the traces (N,) of a `part` of `expected`: by the parameters, and by the rest."""
-        square = _from_either_side(model, square)
-        known, beyond = list[FloatArray](), list[FloatArray]()
-        for own, off in self._seen(model, joints):
+        self,
+        model: ErrorModel,
+        square: FloatArray,
+        joints: FloatArray,
+        part: slice,
+        approach: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return the traces (3, N) of a `part` of `expected`.
+
+        By the uncertainty of the parameters, by fitted play from either side, and by the rest.
+        """
+        square, found = square if approach is not None else _from_either_side(model, square), []
+        for own, *rest in self._seen(model, joints, approach):
             rows = own[:, part]
             along = (rows.reshape(-1, len(square)) @ square).reshape(rows.shape)
-            known.append(np.einsum('ncp,ncp->n', along, rows))
-            beyond.append((off[:, part] ** 2).sum(axis=(1, 2)))
-        return np.concatenate(known), np.concatenate(beyond)
+            beyond = [(off[:, part] ** 2).sum(axis=(1, 2)) for off in rest]
+            found.append([np.einsum('ncp,ncp->n', along, rows), *beyond])
+        return np.concatenate(found, axis=1)
 
     def _seen(
         self, model: ErrorModel, joints: FloatArray, approach: FloatArray | None = None
-    ) -> Iterator[tuple[FloatArray, FloatArray]]:
-        """Yield the columns (B, 6, P) of a model and (B, 6, K) of the joints, in blocks."""
+    ) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+        """Yield the columns (B, 6, P) of a model, of its play, and of the joints, in blocks.
+
+        Its play is as fitted; there is none if the `approach` is known.
+        """
         chain, count, some = model.chain, len(model.names), any(self.sizes.values())
+        known = dict(chain.effects) if approach is None else {}
+        play = {k: known[n] for k, n in enumerate(model.names) if n in known and _is_play(n)}
         every = tuple(dict.fromkeys((*model.names, *(axis_parameters(chain) if some else ()))))
         joints, model = chain.joint_values(joints), ErrorModel(chain, every, *model.ends)
         signs = np.ones_like(joints) if approach is None else approach
@@ -108,13 +122,18 @@ class Unmodelled(NamedTuple):
             block = np.s_[first : first + BLOCK]
             jacobian = model.jacobian(joints[block], signs[block])
             off = self.columns(chain, every, joints[block], jacobian.T) if some else jacobian.T[:0]
-            yield jacobian[..., :count], off.T
+            either = jacobian[..., [*play]] * [*play.values()]
+            yield jacobian[..., :count], either, off.T
 
 
 def _from_either_side(model: ErrorModel, square: FloatArray) -> FloatArray:
     """Return expected squares (P, P) for random signs of moves: nothing else goes with play."""
-    rest = np.array([Parameter(name).kind not in PLAY for name in model.names], dtype=bool)
+    rest = np.array([not _is_play(name) for name in model.names], dtype=bool)
     return np.asarray(square * (np.outer(rest, rest) | np.eye(len(rest), dtype=bool)))
+
+
+def _is_play(name: str) -> bool:
+    return Parameter(name).kind in PLAY
 
 
 NOTHING = Unmodelled()

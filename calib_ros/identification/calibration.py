@@ -58,7 +58,7 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.limits import narrowed
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import Model, Settings
-from calib_ros.shown import Shown, rounded
+from calib_ros.shown import Shown
 
 HEAD = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
 
@@ -185,30 +185,42 @@ class Calibration(Shown):
         shift = before[:, :3, 3] - after[:, :3, 3]
         return norms(shift), norms(turn)
 
-    def sigma(self, joints: FloatArray, components: slice = np.s_[:3]) -> FloatArray:
+    def sigma(
+        self,
+        joints: FloatArray,
+        components: slice = np.s_[:3],
+        approach: FloatArray | None = None,
+    ) -> FloatArray:
         """Return the standard deviation (N,) [m] of predicted positions; NaN if unknown.
 
         Of orientations [rad] by other `components` of the pose. With a region it is the expected
-        error, unmodelled effects included.
+        error, unmodelled effects included; without the `approach` (N, n), signs of the preceding
+        moves, also by fitted play.
         """
-        return np.sqrt(np.add(*self._variances(joints, components)))
+        squares = self._variances(joints, components, approach).sum(axis=0)
+        return np.asarray(np.sqrt(squares))
 
-    def _variances(self, joints: FloatArray, part: slice) -> tuple[FloatArray, FloatArray]:
-        """Return the variances (N,) of a part of poses by the parameters, and by the rest."""
+    def _variances(
+        self, joints: FloatArray, part: slice, approach: FloatArray | None
+    ) -> FloatArray:
+        """Return the variances (3, N) of a part of poses, as `Unmodelled.variances`."""
         if self.region is not None:
-            return self.region.variances(joints, part, self.unmodelled)
+            return self.region.variances(joints, part, approach, self.unmodelled)
         if self.covariance is None:
-            return (np.full(len(joints), np.nan),) * 2
-        return NOTHING.variances(ErrorModel(self.chain, self.names), self.covariance, joints, part)
+            return np.full((3, len(joints)), np.nan)
+        model = ErrorModel(self.chain, self.names)
+        return NOTHING.variances(model, self.covariance, joints, part, approach)
 
     def remaining(self, joints: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the expected remaining error (N,) [m] at joint values (N, n), and `sigma` (N,).
 
         NaN if unknown. The held-out error contains what no parameter explains: that counts once.
+        Joints come from either side.
         """
-        known, beyond = self._variances(joints, np.s_[:3])
-        sigma = np.sqrt(known + beyond)
-        return np.maximum(sigma, np.hypot(np.sqrt(known), self.residual or 0.0)), sigma
+        known, play, beyond = self._variances(joints, np.s_[:3], None)
+        left = np.sqrt(known + play + (self.residual or 0.0) ** 2)
+        sigma = np.sqrt(known + play + beyond)
+        return np.maximum(sigma, left), sigma
 
     @as_annotated
     def expected(self, joints: FloatArray, model: Model) -> FloatArray:
@@ -233,12 +245,16 @@ class Calibration(Shown):
         if self.residual is None:
             return None
         former = ALIKE * self.residual
-        seen = [each.spread() for each in sets if not each.socket]
-        if not seen:
+        few = [each.spread() for each in sets if not each.socket]
+        if not few:
             return former
-        q, ways = (np.concatenate([getattr(s, key) for s in seen]) for key in ('joints', 'ways'))
-        sizes = np.nan_to_num(self.sigma(q)), self.removed(q)[0]
-        expected, removed = (float(np.sqrt(np.mean(ways / 3.0 * each**2))) for each in sizes)
+        sizes = [
+            (self.sigma(each.joints, approach=each.approach), self.removed(each.joints)[0])
+            for each in few
+        ]
+        both = np.nan_to_num(np.concatenate(sizes, axis=1))
+        share = np.concatenate([each.ways for each in few]) / 3.0
+        expected, removed = (float(np.sqrt(np.mean(share * each**2))) for each in both)
         return max(former, min(ALIKE * expected, removed, 1e-3 * rms_mm))
 
     def reused(self, sets: Sequence[Observations]) -> float:
@@ -294,27 +310,6 @@ class Calibration(Shown):
     def commanded_by(self, model: Model) -> Chain:
         """Return the chain that converts poses to joint values for a model."""
         return self.chain if model == 'corrected' else self.before
-
-    def knowledge(self, joints: FloatArray, turned: FloatArray) -> tuple[str, str]:
-        """Return how well a program's poses at joint values (N, n) are known, and a warning.
-
-        `turned` (N,) [rad] are the orientation errors to correct. Both texts are empty if there is
-        nothing to say.
-        """
-        if self.covariance is None:
-            return '', ''
-        shift, turn = self.sigma(joints), self.sigma(joints, np.s_[3:])
-        words = (
-            f'standard deviation of these poses: at most {rounded(1e3 * shift.max())} mm at the '
-            f'target measured and {rounded(1e3 * turn.max())} mrad'
-        )
-        if np.sum(turn**2) <= np.sum(turned**2):
-            return words, ''
-        return words, (
-            'the calibration does not know the orientation well enough to correct it; positions '
-            'hold only near the measured target. Measure orientations too, or a target further '
-            'from the last axis'
-        )
 
 
 def provenance() -> dict[str, str]:

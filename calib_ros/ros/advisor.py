@@ -30,7 +30,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from calib_ros.apply.candidates import draw_candidates
 from calib_ros.apply.choice import Choice
-from calib_ros.apply.compensation import in_words
+from calib_ros.apply.compensation import in_words, knowledge
 from calib_ros.apply.compensator import Compensator
 from calib_ros.apply.design import Design
 from calib_ros.apply.program import compensate_program
@@ -191,7 +191,7 @@ class Guide:
         if result.refusals:
             reasons = [f'point {each.sample + 1}: {each.reason}' for each in result.refusals]
             raise InputError('; '.join([words, *some(reasons)]))
-        known, warning = calibration.knowledge(result.joints, result.orientation_before)
+        known, warning = knowledge(calibration, result)
         words = '; '.join(part for part in (words, known, warning) if part)
         if warning:
             self._node.get_logger().warning(f'trajectory: {warning}')

@@ -39,7 +39,8 @@ def approached(size, one_sided, seed=0, errors=1.0):
 def test_expected_errors_hold_whichever_side_joints_with_play_come_from(one_sided, model):
     """Play of the usual size: from one side it does not show, and 1.5 to 11 times less was stated.
 
-    It may be refused then, as the zeros of the joints are less known.
+    It may be refused then, as the zeros of the joints are less known. Of poses without their sides
+    play that is fitted was left out: errors were 8 times the stated ones.
     """
     squares, rng = [], np.random.default_rng(1)
     for seed in range(6):
@@ -50,13 +51,14 @@ def test_expected_errors_hold_whichever_side_joints_with_play_come_from(one_side
         assert hidden == [UR10E.joint_names[k] for k in one_sided[:5]]
         q = UR10E.random_joints(200, rng)
         sides = rng.choice([-1.0, 1.0], q.shape)
-        reached, wanted = (each.forward(q, sides)[:, :3, 3] for each in (found.chain, true))
-        stated = np.trace(found.pose_covariance(q)[:, :3, :3], axis1=1, axis2=2).mean()
-        squares.append((((reached - wanted) ** 2).sum(axis=1).mean(), stated))
-    actual, stated = np.mean(squares, axis=0)
-    assert np.sqrt(actual / stated) < 1.3
+        for known in (sides, None):
+            error = (found.chain.forward(q, known) - true.forward(q, sides))[:, :3, 3]
+            stated = np.trace(found.pose_covariance(q, known)[:, :3, :3], axis1=1, axis2=2)
+            squares.append(((error**2).sum(axis=1).mean(), stated.mean()))
+    ratios = np.sqrt([np.divide(*np.mean(squares[k::2], axis=0)) for k in (0, 1)])
+    assert (ratios < 1.3).all()
     if len(one_sided) < 6:  # else play of any size up to errors of the zeros is likely
-        assert np.sqrt(actual / stated) > 0.5
+        assert (ratios > 0.5).all()
 
 
 def test_play_of_a_healthy_arm_is_not_corrected_as_an_error_of_its_zeros():

@@ -222,7 +222,7 @@ def test_a_trajectory_is_corrected(calibrated, monkeypatch):
     bends = np.array([point.accelerations for point in answer.points])
     assert 1e-5 < np.abs(bends - accelerations).max() < 0.05
     told = calibrated.log()
-    monkeypatch.setattr(Calibration, 'knowledge', lambda *_: ('', 'too little'))
+    monkeypatch.setattr(guide_module, 'knowledge', lambda *_: ('', 'too little'))
     known, _, _ = said.partition('; standard deviation of')
     assert send(calibrated, message) == f'{known}; too little'
     calibrated.spin_until(lambda: any('trajectory: too little' in each.msg for each in told))
