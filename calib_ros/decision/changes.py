@@ -189,7 +189,8 @@ def reasons_of(
         return ()
     tried = Counter(owner for owner, _ in columns.sets)
     tried |= Counter(dict.fromkeys(OUTSIDE, max(tried.values())))
-    likely, times = zip(*(columns.evidence(information, each) for _, each in columns.sets))
+    evidences = [columns.evidence(information, names) for _, names in columns.sets]
+    likely, times = zip(*evidences, strict=True)
     logs = np.subtract(likely, [np.log(tried[owner]) for owner, _ in columns.sets])
     found = [
         _explanation(information, columns, freedom, *each, *rest)
