@@ -220,7 +220,6 @@ SEVERAL = {
         ('signs that hide each other', True),
         ('a swap and a sign', True),
         ('left-handed, in mm', True),
-        ('two units', True),
         ('two units', False),
         ('sign and zero, in mm', False),
     ],

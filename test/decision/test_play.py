@@ -34,8 +34,9 @@ def approached(size, one_sided, seed=0, errors=1.0):
     return true, replace(measure(true, q, rng, 5e-5, 2e-4, approach=signs), approach=signs)
 
 
-@pytest.mark.parametrize('one_sided', [[], [1], [*range(6)]])
-@pytest.mark.parametrize('model', ['geometric', 'auto'])
+@pytest.mark.parametrize(
+    ('one_sided', 'model'), [([], 'geometric'), ([1], 'auto'), ([*range(6)], 'geometric')]
+)
 def test_expected_errors_hold_whichever_side_joints_with_play_come_from(one_sided, model):
     """Play of the usual size: from one side it does not show, and 1.5 to 11 times less was stated.
 
