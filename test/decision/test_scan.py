@@ -152,15 +152,14 @@ def test_a_drift_is_compared_with_priors_as_they_are_known(monkeypatch):
     assert matrix.diagonal()[fitted.names.index(name)] == pytest.approx(1e18, rel=0.2)
 
 
-@pytest.mark.parametrize('seed', [1, 2])
-def test_a_slow_motion_by_metres_is_none(seed):
+def test_a_slow_motion_by_metres_is_none():
     """Two columns of joint values were swapped: the robot seemed to have moved by 2 or 3 m."""
-    rng = np.random.default_rng([seed, 5])
+    rng = np.random.default_rng([1, 5])
     true, share = arm(rng), np.linspace(0.0, np.pi, 50)[:, np.newaxis]
     waves = [
         rng.normal(size=6) * np.cos(k * share + rng.uniform(0.0, 6.0, 6)) for k in range(1, 5)
     ]
-    seen = measure(true, 0.6 * sum(waves), rng, *NOISE, oriented=seed != 1)
+    seen = measure(true, 0.6 * sum(waves), rng, *NOISE, oriented=False)
     swapped = replace(seen, joints=seen.joints[:, [1, 0, 2, 3, 4, 5]])
     assert find_step(fitting.fit(Problem(UR10E, swapped, **SIGMAS))) is None
 
