@@ -1,14 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The noise of a device that nobody stated: at most what changes of the arm cannot explain.
+"""The noise of a device that nobody stated: at most what no change of the arm explains.
 
-Two bounds are sought, and the smaller counts. The first is what a fit of everything leaves: all
-parameters, frames, wear and load. With M the share of the parameters that positions determine,
-residuals of n coordinates with noise in positions alone have n - 2 tr M + tr M^2 degrees of
-freedom. Few poses leave none.
-
-The second is what one cause leaves: a zero, a joint, a frame, or everything, off from the first
-pose on or wandering since. With position errors e and columns J of the cause, of usual sizes,
+A zero, a joint, a frame, all zeros, the arm, its effects, or everything, may be off from the first
+pose on or wander since. With position errors e and columns J of such a cause, of usual sizes,
 
     e ~ N(0, s^2 (1 + t K))      K = J J^T, or for row i of pose k times min(k_i, k_j)
 
@@ -25,18 +20,14 @@ import numpy as np
 from scipy import special
 
 from calib_ros.decision.changes import SIZES
-from calib_ros.errors import InputError
-from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.levels import CERTAIN, CONFIDENT, TELLING
+from calib_ros.estimation.levels import CERTAIN, CONFIDENT
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.start import reframed
 from calib_ros.estimation.system import row_samples, stacked
-from calib_ros.estimation.uncertainty import covariance
 from calib_ros.estimation.weights import OUTLIER
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
 WORN = ('ratio', 'coupling', 'eccentricity', 'gravity')
@@ -57,37 +48,15 @@ def unstated(sets: Sequence[Observations]) -> list[Observations]:
 def noise_seen(chain: Chain, sets: Sequence[Observations]) -> float:
     """Return the noise [m] that measurements without a covariance show, at most, by an arm.
 
-    The chain is the calibrated one, in the frames of the measurements.
+    The chain is the calibrated one, in the frames of the measurements. Gross errors are left out.
     """
     worn = [name for group in WORN for name in effects.members(chain, group)]
-    return min(_beside_all(chain, sets, worn), _beside_one(chain, sets, worn))
-
-
-def _beside_all(chain: Chain, sets: Sequence[Observations], worn: Sequence[Parameter]) -> float:
-    """Return the noise [m] that a fit of everything leaves, inf of few poses."""
-    chain = reframed(chain, chain.frame_names, fixed=False)
-    problem = Problem(chain, sets[0], more=sets[1:], effects=worn, loss='none')
-    try:
-        fitted = fit(problem)
-    except (InputError, np.linalg.LinAlgError):
-        return np.inf
-    share = covariance(fitted.factor) @ fitted.robust.fit.normal.parts[0]
-    count = float(sum(each.ways.sum() for each in sets))
-    taken = float(np.trace(share))
-    free = min(count - taken, count - 2.0 * taken + float(np.sum(share * share.T)))
-    if free < TELLING:
-        return np.inf
-    likely = fitted.noise.position * np.sqrt((count - taken) / special.chdtri(free, CONFIDENT))
-    return float(likely * problem.sigma_position)
-
-
-def _beside_one(chain: Chain, sets: Sequence[Observations], worn: Sequence[Parameter]) -> float:
-    """Return the noise [m] beside one cause, gross errors left out."""
     plain = [replace(each, oriented=np.zeros_like(each.oriented)) for each in sets]
     problem = Problem(chain, plain[0], more=plain[1:])
     frames = dict.fromkeys(frame for each in sets for frame in (each.base, each.tool))
     own = [name for frame in frames for name in parameters_of(frame)]
-    names = (*own, *(name for name in chain.parameter_names if name.of_dh), *worn)
+    arm = [name for name in chain.parameter_names if name.of_dh]
+    names = (*own, *arm, *worn)
     system = problem.system(plain).spread(SOME_POSES // 2)
     rows = system.rows_of(chain.with_effects(worn), names)
     flat, number = stacked(rows), row_samples(rows)
@@ -97,10 +66,11 @@ def _beside_one(chain: Chain, sets: Sequence[Observations], worn: Sequence[Param
     when = np.argsort(np.argsort(stamps, kind='stable'))[number[kept]] + 1.0
     sizes = [SIZES.get(name.unit) or effects.expected(name) for name in names]
     columns, errors = flat[kept, :-1] * sizes, flat[kept, -1]
-    causes = [{joint.driven} for joint in chain.joints]
+    zeros = [joint.driven for joint in chain.joints]
+    causes = [*({zero} for zero in zeros), {*zeros}, {*arm}, {*worn}, {*names}]
     causes += [{n for n in names if n.owner == owner} for owner in {n.owner: 0 for n in names}]
     kernels = []
-    for cause in (*causes, {*names}):
+    for cause in causes:
         some = columns[:, [name in cause for name in names]]
         still = some @ some.T
         kernels += [still, still * np.minimum.outer(when, when)] if still.any() else []

@@ -118,9 +118,14 @@ def test_few_poses_tell_no_noise_from_a_change(cell, arm, seed, count, worse):
 
 
 @pytest.mark.parametrize(
-    'offsets', [{'elbow_joint.theta': 1e-3}, {'elbow_joint.a': 1e-3, 'elbow_joint.alpha': 1e-3}]
+    'offsets',
+    [
+        {'elbow_joint.theta': 1e-3},
+        {'elbow_joint.a': 1e-3, 'elbow_joint.alpha': 1e-3},
+        dict(zip((f'{n}.theta' for n in UR.joint_names[1:4]), (1e-3, -1e-3, 1e-3), strict=True)),
+    ],
 )
-def test_few_poses_show_a_slip_and_a_bent_link(cell, arm, offsets):
+def test_few_poses_show_slips_and_a_bent_link(cell, arm, offsets):
     changed = cell[0].with_offsets(offsets)
     for seed in range(2):
         q = UR.random_joints(10, np.random.default_rng(seed))
