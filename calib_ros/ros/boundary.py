@@ -16,7 +16,7 @@ from rclpy.exceptions import InvalidHandle
 from calib_ros.errors import CalibrationError, trouble
 
 Answer = tuple[bool, str]
-Work = Callable[[], Answer]
+Job = Callable[[], Answer]
 
 
 class Boundary:
@@ -51,7 +51,7 @@ class Boundary:
                 self._log()
             return None
 
-    def answer(self, name: str, work: Work) -> Answer:
+    def answer(self, name: str, work: Job) -> Answer:
         """Run the work of a service; an error becomes its answer and is logged."""
         try:
             success, text = work()

@@ -12,7 +12,7 @@ from typing import Any
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from calib_ros.ros.boundary import Answer, Work
+from calib_ros.ros.boundary import Answer, Job
 
 
 class DeferredTrigger:
@@ -30,8 +30,8 @@ class DeferredTrigger:
         self,
         node: Node,
         name: str,
-        answer: Callable[[str, Work], Answer],
-        prepare: Callable[[], Work],
+        answer: Callable[[str, Job], Answer],
+        prepare: Callable[[], Job],
     ) -> None:
         self._answer, self._prepare = partial(answer, name), prepare
         self._thread: threading.Thread | None = None
@@ -51,7 +51,7 @@ class DeferredTrigger:
 
     def _on_call(self, request: Any, response: Any) -> Any:
         """Return what begins the work (`InOrder.execute`), or the answer that it cannot."""
-        work: list[Work] = []
+        work: list[Job] = []
 
         def prepare() -> Answer:
             if self.busy:
@@ -72,7 +72,7 @@ class DeferredTrigger:
         else:
             self._thread = thread
 
-    def _run(self, work: Work, response: Any, send: Callable[[Any], None]) -> None:
+    def _run(self, work: Job, response: Any, send: Callable[[Any], None]) -> None:
         response.success, response.message = self._answer(work)
         self._running.clear()  # before the answer, since the caller may call again at once
         try:

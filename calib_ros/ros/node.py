@@ -38,7 +38,7 @@ from calib_ros.identification.recalibration import recalibrate
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import documents, words
 from calib_ros.ros.advisor import Guide
-from calib_ros.ros.boundary import Answer, Boundary, Work
+from calib_ros.ros.boundary import Answer, Boundary, Job
 from calib_ros.ros.calls import InOrder
 from calib_ros.ros.deferred import DeferredTrigger
 from calib_ros.ros.diagnostics import Diagnostics
@@ -136,7 +136,7 @@ class CalibrationNode(Batched):
         ):
             self.create_service(kind, name, self._answering(name, callback))
         identify, keeper = self._identifying, self._keeper
-        slow: dict[str, Callable[[], Work]] = {
+        slow: dict[str, Callable[[], Job]] = {
             '~/identify': lambda: partial(identify.run, identify.snapshot(self._inputs)),
             '~/export': keeper.export,
             '~/save': keeper.save,
@@ -263,7 +263,7 @@ class CalibrationNode(Batched):
                 'wait for its answer, or call ~/cancel'
             )
 
-    def _prepared(self, name: str, begin: Callable[[], Work]) -> Work:
+    def _prepared(self, name: str, begin: Callable[[], Job]) -> Job:
         """Return the work of a service; it says first if it uses an earlier calibration."""
         self._take_messages()
         if name in WRITING:
@@ -294,7 +294,7 @@ class CalibrationNode(Batched):
         self.session.remove_last()
         return True, f'{self._archive.trouble}pose {len(self.session.samples) + 1} removed'
 
-    def _to_validate(self) -> Work:
+    def _to_validate(self) -> Job:
         session = self.session
         judged, problem = session.since(), partial(session.problem_of, session.usable)
         file = partial(self._filer.file, problem, session.settings)
@@ -365,7 +365,7 @@ class CalibrationNode(Batched):
         answers = {'last identification': last, 'observability': observability}
         return answers | self._guide.figures()
 
-    def _answer(self, name: str, work: Work) -> Answer:
+    def _answer(self, name: str, work: Job) -> Answer:
         answer = self._boundary.answer(name, work)
         return self._identifying.shortened(answer) if name == '~/identify' else answer
 

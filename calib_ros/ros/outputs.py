@@ -24,7 +24,7 @@ from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics.chain_file import chain_text, parse_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.ros import to_ros
-from calib_ros.ros.boundary import Answer, Work
+from calib_ros.ros.boundary import Answer, Job
 from calib_ros.ros.broadcast import Broadcast
 from calib_ros.ros.parameters import NodeValues
 from calib_ros.ros.to_ros import LATCHED
@@ -94,7 +94,7 @@ class Keeper:
             self._broadcast.publish(calibration.chain, *where)
         self._adopted(calibration, self._world(calibration))
 
-    def save(self) -> Work:
+    def save(self) -> Job:
         """Return how the calibration, to `target_filename` as it is now, is saved."""
         if not self._published.text:
             raise InputError(
@@ -145,7 +145,7 @@ class Keeper:
         self.adopt(calibration, Published(text, ''))
         return f'{path}, {calibration.whose}{lost}'
 
-    def export(self) -> Work:
+    def export(self) -> Job:
         """Return how the calibration, checked at the samples, is written in all formats."""
         session = self._session
         if session.calibration is None:
