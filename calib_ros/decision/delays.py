@@ -5,6 +5,7 @@
 The delay of each device is fitted. Joints that are not read at one moment have delays of their
 own, and clocks that drift apart or jump one that changes, here by cosines over the session. Such a
 delay d moves a joint by -d times its speed: play with the speed for the sign of the approach.
+Where speeds are not known, joints measured in motion seem to be off at random.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ import numpy as np
 from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.gain import gain_share
-from calib_ros.estimation.levels import TELLING
+from calib_ros.estimation.levels import ALIKE, NEARER, TELLING
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.system import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import Parameter
@@ -68,6 +70,25 @@ def uneven(problem: Problem, result: Identification) -> tuple[str, Problem] | No
             joints[:, own] += each.velocity[:, own] * np.einsum('k,knl->nl', sizes, modes(each))
         sets.append(replace(each, joints=joints))
     return text, problem.with_sets(sets)
+
+
+def unsteady(result: Identification) -> tuple[str, bool]:
+    """Return that joints seem to be off at random by more than arms are, and whether it is a lag.
+
+    It is if some other reason refuses the result as well, or if that is more than any arm's play
+    and the correction lowers the error by less than a third.
+    """
+    lacking, typical = result.posterior.unmodelled, TYPICAL['angle']
+    if not (lacking.random and lacking.turns > typical):
+        return '', False
+    before, after = (result.validation or result.fitted).figures
+    slight = before.rms_mm < ALIKE * after.rms_mm and lacking.turns > typical / NEARER
+    text = (
+        f'joints seem off by {1e3 * lacking.turns:.2g} mrad at random, from pose to pose: the arm '
+        'moved while it was measured, joint values and poses are not of one moment, values lack '
+        'digits, or joints have play. Stop at each pose, and compare the clocks'
+    )
+    return text, bool(result.refusals) or slight
 
 
 def _explained(

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.decision.delays import uneven
+from calib_ros.decision.delays import uneven, unsteady
 from calib_ros.decision.lost_rows import computed_rows
 from calib_ros.decision.misfits import explained_share, loose_target
 from calib_ros.decision.printed_board import stretched
@@ -225,13 +225,14 @@ def _lag(problem: Problem, result: Identification) -> Identification:
         found = _stop_lag(problem, result)
     else:
         found = uneven(problem, result)
-    if found is None:
-        return result
-    text, other = found
-    if other is not None and _imitated(other, result):
+    text, harmful = unsteady(result)
+    if found is not None:
+        text, other = found
+        harmful = other is not None and _imitated(other, result)
+    if harmful:
         reason = Reason.with_remedy(Rule.LAG, text)
         return replace(result, refusals=(*result.refusals, reason))
-    return replace(result, remarks=(*result.remarks, text))
+    return replace(result, remarks=(*result.remarks, *[text] * bool(text)))
 
 
 def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | None] | None:

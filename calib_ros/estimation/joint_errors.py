@@ -25,7 +25,8 @@ class Unmodelled(NamedTuple):
 
     At random each joint turns about its axis (slides along it [m], if prismatic), and the axis
     tilts. The axis also wobbles by waves, which the parameters `names` (P,) follow by `followed`
-    (P, T) a unit; waves that are not `shown` by the data are assumed.
+    (P, T) a unit; waves that are not `shown` by the data are assumed, turns and tilts that are not
+    `random` by a test may be the device's noise.
     """
 
     turns: float = 0.0
@@ -34,6 +35,7 @@ class Unmodelled(NamedTuple):
     names: tuple[str, ...] = ()
     followed: FloatArray = np.zeros((0, 1))
     shown: bool = False
+    random: bool = False
 
     @property
     def sizes(self) -> dict[str, float]:

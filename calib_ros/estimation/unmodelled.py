@@ -71,13 +71,12 @@ def unmodelled_errors(
     rows = np.concatenate([rows[:count], wobble_columns(random[1], units.joints), rows[-1:]])
     products = np.array([gram(rows[:, part_of == k]) for k in range(len(used))])
     groups = configurations(units.joints)
-    turns, tilts, waves, shown = _sizes(posterior, rows, (part_of, groups), products, random)
+    sizes = _sizes(posterior, rows, (part_of, groups), products, random)
     rest = [k for k, name in enumerate(names) if name in posterior.priors and k >= own]
     along = stride * products.sum(axis=0)[:own, :-1]
     middle = along[:, rest] @ posterior.square[np.ix_(rest, rest)] @ along[:, rest].T
     followed = covariance(factor) @ along[:, count:]
-    found = Unmodelled(turns, tilts, waves, names[:own], followed, shown)
-    return found, covariance(factor, middle)
+    return sizes._replace(names=names[:own], followed=followed), covariance(factor, middle)
 
 
 def _sizes(
@@ -86,8 +85,8 @@ def _sizes(
     owners: tuple[Index, Index],
     products: FloatArray,
     random: Sequence[FloatArray],
-) -> tuple[float, float, float, bool]:
-    """Return the sizes of turns, tilts and waves, and whether waves show.
+) -> Unmodelled:
+    """Return the sizes of turns, tilts and waves, and whether they show.
 
     From weighted rows (P + T + 1, c, n), those of T waves and the residual last, of parts (c,) and
     configurations (n,), their `products` by part, and rows of `random` turns and tilts.
@@ -100,7 +99,7 @@ def _sizes(
     for _ in range(SEVERAL):
         variances, shift = _variances(products, offsets, precision, counts)
         if not variances.all():
-            return 0.0, 0.0, TYPICAL['drive'], False
+            return Unmodelled(waves=TYPICAL['drive'])
         left = rows[-1] - np.tensordot(shift, rows[: len(shift)], 1)
         often = _shared(left, part_of, groups)
         total = np.tensordot(1.0 / (often * variances), products, 1)
@@ -121,8 +120,8 @@ def _sizes(
     whites = rows.any(axis=0).T & (part_of == np.arange(len(variances))[:, np.newaxis, np.newaxis])
     kernels = [*whites[..., np.newaxis] * np.eye(len(part_of))]
     kernels += [each @ np.swapaxes(each, 1, 2) for each in (turned, tilted)]
-    turn, tilt = _random(np.array(kernels), basis, residual[..., 0], variances).tolist()
-    return turn, tilt, waves, found is not None
+    (turns, tilts), sure = _random(np.array(kernels), basis, residual[..., 0], variances)
+    return Unmodelled(float(turns), float(tilts), waves, shown=found is not None, random=sure)
 
 
 def _size_of_waves(
@@ -186,8 +185,8 @@ def _shared(left: FloatArray, part_of: Index, groups: Index) -> FloatArray:
 
 def _random(
     kernels: FloatArray, basis: FloatArray, residual: FloatArray, variances: FloatArray
-) -> FloatArray:
-    """Return the standard deviations (2,) of the last two kernels (K + 2, n, c, c).
+) -> tuple[FloatArray, bool]:
+    """Return the standard deviations (2,) of the last two kernels (K + 2, n, c, c), if by a test.
 
     For the posterior's columns (n, c, P), scaled, and its residuals (n, c), and the noise (K,).
     Turns that the test would not tell from noise, else tilts, have its size beyond the sigma.
@@ -206,9 +205,9 @@ def _random(
         squares = (pairs[arm, white] @ beyond) / np.maximum(sizes[arm], 1e-300)
         hidden = squares * own <= limit  # the test would not tell them from noise
         hidden[1] &= not hidden[0]
-        return np.asarray(np.sqrt(squares * hidden))
+        return np.sqrt(squares * hidden), False
     flat, spread = (x.reshape(*x.shape[:-3], -1, x.shape[-1]) for x in (basis, kernels @ basis))
     inner = flat.T @ spread
     cross, both = (x @ x.T for x in (x.reshape(len(kernels), -1) for x in (spread, inner)))
     values -= taken - np.tensordot(inner, inner[white].sum(axis=0))
-    return np.asarray(np.sqrt(nonnegative(pairs - 2.0 * cross + both, values)[arm]))
+    return np.sqrt(nonnegative(pairs - 2.0 * cross + both, values)[arm]), True

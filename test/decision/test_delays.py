@@ -12,11 +12,11 @@ from calib_ros.apply.simulation import measure
 from calib_ros.decision.delays import uneven
 
 
-def moving(count, delays=0.0, noise=NOISE):
+def moving(count, delays=0.0, noise=NOISE, errors=1.0):
     """Return poses in motion, joints late by some delays (count, 6) [s], by a clock."""
     rng = np.random.default_rng(1)
     joints, speed = UR10E.random_joints(count, rng), 0.3 * rng.normal(size=(count, 6))
-    seen = measure(arm(0), joints - delays * speed, rng, *noise)
+    seen = measure(arm(0, errors), joints - delays * speed, rng, *noise)
     stamps = 1_700_000_000_000_000_000 + 100_000_000 * np.arange(count)
     return replace(seen, joints=joints, velocity=speed, stamps_ns=stamps)
 
@@ -49,6 +49,30 @@ def test_a_delay_that_changes_is_undone_where_the_arm_moved():
     np.testing.assert_allclose(moved, -delays[:, 0], rtol=0, atol=4e-4)
     (rest,) = there.more
     np.testing.assert_array_equal(rest.joints, at_rest.joints)
+
+
+@pytest.mark.parametrize(
+    ('late', 'errors', 'reasons', 'remarks'),
+    [(30e-3, 1.0, 1, 0), (15e-3, 2.0, 1, 0), (6e-3, 1.0, 0, 1), (15e-3, 8.0, 0, 1)],
+)
+def test_joints_late_at_unknown_speeds_seem_off_at_random(late, errors, reasons, remarks):
+    """Such a result is refused if the correction hardly helps."""
+    seen = replace(moving(60, late, errors=errors), velocity=None)
+    result = identify(Problem(UR10E, seen, **SIGMAS))
+    found = [
+        [each for each in told if 'at random' in each]
+        for told in (result.refusals, result.remarks)
+    ]
+    assert [*map(len, found)] == [reasons, remarks]
+    assert (not reasons) == result.accepted
+
+
+def test_noise_of_the_device_is_no_motion():
+    """Twenty times what is stated: the correction lowers the error by less than a third."""
+    seen = replace(moving(60, noise=20.0 * np.array(NOISE)), velocity=None)
+    result = identify(Problem(UR10E, seen, **SIGMAS))
+    assert result.accepted
+    assert not any('at random' in each for each in result.remarks)
 
 
 @pytest.mark.parametrize('count', [100, 8])
