@@ -114,9 +114,9 @@ def by_first(value):
     return {str(first): dict(rest) for (_, first), *rest in rows}
 
 
-def within(result, q, error):
+def within(result, q, error, approach=None):
     """Tell (N,) whether errors (N, 3) of positions are within the 95 % ellipsoids."""
-    axes = result.confidence_ellipsoid(q)
+    axes = result.confidence_ellipsoid(q, approach=approach)
     along = np.einsum('nij,nj->ni', axes, error) / (axes**2).sum(axis=2)
     return (along**2).sum(axis=1) <= 1.0
 

@@ -7,9 +7,15 @@
 Simulated UR10e with errors of 0.5 mm and 1 mrad, 40 full poses or 60 positions a run, default
 settings. `mse_over_crlb` is the mean squared error of the fitted parameters over the Cramer-Rao
 bound at the true chain, averaged over parameters; `coverage_95` the share of 95 % intervals that
-hold the truth: per parameter, and for predicted positions at poses that were not measured.
-`few_unknown_noise` has 12 poses, 72 equations for 30 parameters, and sigmas that are half the true
-ones, so that the noise is found from the residuals.
+hold the truth: of all parameters, of the worst and the best of them (`least`, `most`), and of
+predicted positions at poses that were not measured.
+`few` has 12 poses, 72 equations for 30 parameters, and sigmas that are half the true ones, so that
+the noise is found from the residuals.
+
+`chosen`: 60 full poses with the signs of the last moves, by `--model auto`, of arms with an effect
+of up to 0.3 mrad; or with waves that no model has, of half the device's sigma in each coordinate
+(`below_noise`). Positions are those of poses from an unknown side, `sided` from a known one; those
+`added` with half the sigma added to their covariance.
 
 `incomplete`: arms with an effect that the model lacks, 60 full poses, default sigmas; the coverage
 of parameters and of positions, and the median ratio of actual to stated RMS error of positions
@@ -21,6 +27,7 @@ from dataclasses import replace
 
 import bench
 import numpy as np
+from scipy import special
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.estimation import uncertainty
@@ -29,19 +36,21 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.difference import difference
 from calib_ros.identification.identification import identify
+from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 
 SIGMA_POSITION, SIGMA_ORIENTATION = 5e-5, 2e-4
-KINDS = {'pose': (True, 40), 'position': (False, 60)}
-FEW = (True, 12, 0.5)
+KINDS = {'pose': (True, 40, 1.0), 'position': (False, 60, 1.0), 'few': (True, 12, 0.5)}
+COUNTED = ('parameters', 'sided', 'positions', 'added')
+CHOSEN = ('none', 'eccentricity', 'gravity', 'backlash', 'below_noise')
 LACKING = ('wobble', 'backlash', 'rocking', 'gear', 'gravity')
 SIZE = 3e-4
 """Largest turn [rad] by an effect: position errors of 0.1 to 0.25 mm (RMS)."""
 
 
-def one_run(nominal, seed, oriented, poses, told=1.0):
+def one_run(nominal, seed, oriented, poses, told):
     """Return squared deviation / bound (P,), hits per parameter (P,), hits of positions (M,)."""
     rng = np.random.default_rng(seed)
     true = faulty(nominal, Cell(), rng)
@@ -64,10 +73,41 @@ def one_run(nominal, seed, oriented, poses, told=1.0):
 
 def off(result, true):
     """Return how far (P,) parameters are from the true ones, and whether within their limits."""
+    true = true.with_effects([name for name, _ in result.chain.effects])
     deviation = np.array([result.chain.offset(name, true) for name in result.names])
     width = {p.name: p.half_width() / p.std for p in result.parameters if p.std is not None}
     limit = np.array([width[name] for name in result.names])
     return deviation, np.abs(deviation) <= limit * np.sqrt(np.diag(result.covariance))
+
+
+def chosen(nominal, kind, seed, poses=60):
+    """Return hits of parameters (P,) and of positions (M,): `sided`, from any side, `added`."""
+    rng = np.random.default_rng([seed, CHOSEN.index(kind)])
+    arm = faulty(nominal, Cell(), rng)
+    names = effects.members(arm, kind) if kind in effects.GROUPS else ()
+    sizes = SIZE * rng.uniform(-1.0, 1.0, len(names))
+    true = arm.with_effect_values(dict(zip(names, sizes.tolist(), strict=True)))
+    waves = rng.normal(size=(3, len(true.joints))), rng.uniform(0.0, 6.28, (3, 1))
+    half = SIGMA_POSITION * np.sqrt(0.5) * (kind == 'below_noise')
+
+    def unknown(q):
+        return half * np.sin(waves[0] @ q.T + waves[1]).T
+
+    q = nominal.random_joints(poses + 1, rng)
+    sides = np.sign(np.diff(q, axis=0))
+    seen = measure(true, q[1:], rng, SIGMA_POSITION, SIGMA_ORIENTATION, approach=sides)
+    seen = replace(seen, positions=seen.positions + unknown(q[1:]), approach=sides)
+    result = identify_model(Problem(nominal, seen, held_out=seen.select(np.arange(2))), 'auto')
+    places = nominal.random_joints(50, rng)
+    sides = rng.choice([-1.0, 1.0], places.shape)
+    reached = true.forward(places, sides)[:, :3, 3] + unknown(places)
+    found = [off(result, true)[1]]
+    for known in (sides, None):
+        error = result.chain.forward(places, known)[:, :3, 3] - reached
+        found.append(bench.within(result, places, error, known))
+    squares = result.pose_covariance(places)[:, :3, :3] + (SIGMA_POSITION / 2) ** 2 * np.eye(3)
+    far = np.einsum('nc,ncd,nd->n', error, np.linalg.inv(squares), error)
+    return *found, far <= special.chdtri(3, 0.05)
 
 
 def lacking(kind, true, rng):
@@ -136,26 +176,22 @@ def main():
     options = bench.options(__doc__, runs=1000, quick=(False, '500 runs'), json=False)
     runs = 500 if options.quick else options.runs
     nominal = load_chain('ur10e')
-    found = {'runs': runs, 'mse_over_crlb': {}, 'coverage_95': {}}
-    found['coverage_of_single_parameters'] = {}
-    for kind, (oriented, poses) in KINDS.items():
-        rows = [one_run(nominal, seed, oriented, poses) for seed in range(runs)]
+    found = {'runs': runs, 'coverage_95': {}, 'chosen': {}, 'incomplete': {}}
+    for kind, setting in KINDS.items():
+        rows = [one_run(nominal, seed, *setting) for seed in range(runs)]
         ratios, hits, positions = (np.array(column) for column in zip(*rows, strict=True))
-        found['mse_over_crlb'][kind] = float(ratios.mean())
+        single = hits.mean(axis=0)
         found['coverage_95'][kind] = {
+            'mse_over_crlb': float(ratios.mean()),
             'parameters': float(hits.mean()),
+            'least': float(single.min()),
+            'most': float(single.max()),
             'positions': float(positions.mean()),
         }
-        single = hits.mean(axis=0)
-        found['coverage_of_single_parameters'][kind] = [float(single.min()), float(single.max())]
-    rows = [one_run(nominal, seed, *FEW) for seed in range(runs // 2)]
-    _, hits, positions = (np.array(column) for column in zip(*rows, strict=True))
-    found['few_unknown_noise'] = {
-        'runs': len(rows),
-        'parameters': float(hits.mean()),
-        'positions': float(positions.mean()),
-    }
-    found['incomplete'] = {}
+    for kind in CHOSEN:
+        rows = [map(np.mean, chosen(nominal, kind, seed)) for seed in range(runs // 5)]
+        means = np.array([[*row] for row in rows]).mean(axis=0).tolist()
+        found['chosen'][kind] = dict(zip(COUNTED, means, strict=True))
     for kind in LACKING:
         rows = [incomplete(nominal, kind, seed) for seed in range(runs // 10)]
         hits, places, claimed, apart, actual, stated = map(np.array, zip(*rows, strict=True))
