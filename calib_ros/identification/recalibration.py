@@ -75,7 +75,7 @@ def recalibrate(
     problem = replace(problem, chain=reframed(problem.chain, ours, fixed=False))
     if mistake := mistakes.diagnose(problem, far=True):
         raise InputError(f'the new poses do not fit the arm: {mistake}')
-    problem = _with_noise(problem, previous, stated)
+    problem = previous.noise.expected_in(problem, stated) if previous.noise else problem
     try:
         found, arm = _recalibrated(previous, problem, years, growth, new)
     except (np.linalg.LinAlgError, FloatingPointError) as error:  # some are kilometres off
@@ -118,10 +118,6 @@ def _released(previous: Calibration, new: Sequence[str]) -> Calibration:
     arms = previous.chain, previous.before
     chain, before = (reframed(each, new, fixed=False) for each in arms)
     return replace(previous, chain=chain, before=before, region=region)
-
-
-def _with_noise(problem: Problem, previous: Calibration, stated: Sequence[str]) -> Problem:
-    return previous.noise.expected_in(problem, stated) if previous.noise else problem
 
 
 def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Problem]]:
