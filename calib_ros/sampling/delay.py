@@ -4,20 +4,24 @@
 
 The speed of the target by joints and chain and the speed by the measurements are the same signal.
 Angular speed depends on no frame; linear speed is that of the flange, close enough to the target's
-for a start. The lag of highest correlation is refined by a parabola; in motion the identification
-then fits the rest as a parameter (`base.delay`).
+for a start. Then the velocity of the target, in the axes of the device, is a sum of those of the
+flange and of the axes there: of the lags that speeds do not tell apart, that with the least rest
+of this linear fit. The best lag is refined by a parabola; in motion the identification then fits
+the rest as a parameter (`base.delay`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
+from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import ALIKE, MOST_OUTLIERS, TELLING
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.slices import Stamps
 from calib_ros.settings import EXCEPTION, Settings
 
@@ -32,6 +36,8 @@ RISE = EXCEPTION * (1.0 - ALIKE_ENOUGH)
 """Least rise of a correlation peak above a valley: a tenth of what it may lack."""
 MOST_TIME = 100.0 * LEAST_MOTION
 """Longest motion evaluated [s], the latest: it must not grow with gaps in the stamps."""
+
+Rates: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -75,8 +81,7 @@ def find_delay(
         return None
     poses = chain.forward(joints[nearest])
     turns = None if rotations is None else poses[:, :3, :3]
-    first = _speed(joint_times[nearest], poses[:, :3, 3], turns)
-    by_joints = np.interp(grid, *first)
+    by_joints = np.interp(grid, *_speed(joint_times[nearest], poses[:, :3, 3], turns))
     moving = known_motion & (by_joints > EXCEPTION * np.percentile(by_joints, 95))
     if moving.sum() * STEP < LEAST_MOTION:
         return None
@@ -89,16 +94,50 @@ def find_delay(
     best = int(np.argmax(score))
     if score[best] < ALIKE_ENOUGH or best in (0, len(lags) - 1):
         return None
-    left, middle, right = score[best - 1 : best + 2]
+    if rotations is None:
+        flange = _rates(joint_times[nearest], poses[:, :3].reshape(-1, 12))
+        score = _fitted(score, grid[known_motion], flange, _rates(times, positions))
+        best = int(np.argmax(score))
+    alike = _alike(score)
+    left, middle, right = np.pad(score, 1)[best : best + 3]
     bend = left - 2.0 * middle + right
     shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
     others = peaks(score, RISE)
-    apart = np.sqrt(1.0 - np.maximum(score, 0.0) ** 2)
-    alike = apart < ALIKE * apart[best]
     rivals = lags[others[(others != best) & alike[others]]].tolist()
     reach = max(int(np.argmin(np.append(a, False))) for a in (alike[best::-1], alike[best:]))
     seconds = float(lags[best] + shift * STEP)
     return Delay(seconds, float(score[best]), tuple(rivals), STEP * reach)
+
+
+def _alike(score: FloatArray) -> Flags:
+    """Return which correlations (N,) leave nearly as little as the best."""
+    apart = np.sqrt(1.0 - np.clip(score, 0.0, 1.0) ** 2)
+    return np.asarray(apart <= ALIKE * apart.min())
+
+
+def _fitted(score: FloatArray, grid: FloatArray, flange: Rates, target: Rates) -> FloatArray:
+    """Return the correlations (L,) of a target's velocities and those fitted to them by lag.
+
+    By the rates (N, 12) of position and axes of the flange at known times (T,). Lags whose speeds
+    are less alike, of the `score` (L,), count for nothing.
+    """
+    times, seen = target
+    found = np.flatnonzero(_alike(score))
+    lags = STEP * (found - len(score) // 2)
+    inner = grid[(grid + lags[0] >= times[0]) & (grid + lags[-1] <= times[-1])]
+    if len(inner) * STEP < LEAST_MOTION:
+        return score
+    inner = inner[:: int(len(inner) * STEP / LEAST_MOTION)]
+    columns = np.array([np.interp(inner, flange[0], each) for each in flange[1].T]).T
+    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    basis = basis[:, sizes > DEGENERATE * sizes[0]]
+    at = inner[:, np.newaxis] + lags
+    moved = np.array([np.interp(at, times, each) for each in seen.T])
+    whole = (moved**2).sum(axis=(0, 1))
+    kept = (np.einsum('nk,cnl->kcl', basis, moved, optimize=True) ** 2).sum(axis=(0, 1))
+    fitted = np.full_like(score, -1.0)
+    fitted[found] = np.sqrt(kept / np.maximum(whole, 1e-300))
+    return fitted
 
 
 def peaks(score: FloatArray, rise: float) -> Index:
@@ -119,21 +158,30 @@ def peaks(score: FloatArray, rise: float) -> Index:
     return np.array(found, dtype=np.intp)
 
 
-def _speed(
-    times: FloatArray, positions: FloatArray, rotations: FloatArray | None
-) -> tuple[FloatArray, FloatArray]:
+def _speed(times: FloatArray, positions: FloatArray, rotations: FloatArray | None) -> Rates:
     """Return times and speeds over SMOOTHING, angular if rotations (N, 3, 3) are given."""
+    if rotations is None:
+        middle, rates = _rates(times, positions)
+        return middle, np.linalg.norm(rates, axis=1)
+    first, last = _steps(times)
+    turn = np.swapaxes(rotations[first], 1, 2) @ rotations[last]
+    way = np.linalg.norm(se3.log_rotation(turn), axis=1)
+    return 0.5 * (times[first] + times[last]), way / (times[last] - times[first])
+
+
+def _rates(times: FloatArray, values: FloatArray) -> Rates:
+    """Return times and the rates (M, c) of values (N, c) over SMOOTHING."""
+    first, last = _steps(times)
+    rates = (values[last] - values[first]) / (times[last] - times[first])[:, np.newaxis]
+    return 0.5 * (times[first] + times[last]), rates
+
+
+def _steps(times: FloatArray) -> tuple[Index, Index]:
+    """Return first and last of pairs of times (N,) about SMOOTHING apart."""
     behind = np.searchsorted(times, times + SMOOTHING)
     behind = np.minimum(np.maximum(behind, np.arange(len(times)) + 1), len(times) - 1)
     first = np.flatnonzero(times[behind] > times)
-    last = behind[first]
-    span = times[last] - times[first]
-    if rotations is not None:
-        turn = np.swapaxes(rotations[first], 1, 2) @ rotations[last]
-        way = np.linalg.norm(se3.log_rotation(turn), axis=1)
-    else:
-        way = np.linalg.norm(positions[last] - positions[first], axis=1)
-    return 0.5 * (times[first] + times[last]), way / span
+    return first, behind[first]
 
 
 def _correlations(first: FloatArray, second: FloatArray, known: tuple[int, int]) -> FloatArray:

@@ -54,8 +54,7 @@ def error(chain, true, motion):
 @pytest.mark.parametrize(('delay', 'oriented'), [(0.2, False), (-0.05, True)])
 def test_a_delay_is_found_and_costs_nothing(delay, oriented):
     session, true, motion = recorded(delay, oriented=oriented)
-    # by positions alone the speeds compared are those of two points, the flange and the target
-    assert session.delay.seconds == pytest.approx(delay, abs=5e-3 if oriented else 3e-2)
+    assert session.delay.seconds == pytest.approx(delay, abs=5e-3)
     result = session.identify()
     (found,) = (p for p in result.parameters if p.name == 'base.delay')
     assert found.value == pytest.approx(delay, abs=5e-5)
@@ -126,11 +125,9 @@ def test_a_target_that_was_carried_to_the_arm_stays_in_the_account_alone():
     assert (stood.status, stood.explains) == ('', False)
 
 
-@pytest.mark.parametrize(('seed', 'jump'), [(1, 0.0), (1, 0.5), (3, 0.0), (3, 0.1)])
-def test_a_delay_known_roughly_is_no_shift_of_the_clocks(seed, jump):
-    """By positions alone it is off by up to a tenth of a second in smooth motion: the target is
-    not the flange. The surest delay so far is the one to compare with.
-    """
+@pytest.mark.parametrize(('seed', 'jump'), [(1, 0.0), (1, 0.08), (3, 0.0), (3, 0.08)])
+def test_a_shift_of_the_clocks_is_told_by_positions_alone(seed, jump):
+    """Although the target is not the flange, and moves at another speed."""
     true, motion, rng = true_cell(seed)
     joint_times, times = np.arange(0.0, 60.0, 0.01), np.arange(0.05, 59.0, 0.02)
     seen = measure(true, motion(times), rng, *NOISE, oriented=False)
