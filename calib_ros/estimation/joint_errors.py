@@ -76,14 +76,16 @@ class Unmodelled(NamedTuple):
         """Return the expected squares (N, 6, 6) of pose errors [m, rad] at joint values (N, n).
 
         In world axes, with expected squares (P, P) of the model's parameters. `approach` (N, n)
-        holds the signs of the preceding moves; without it joints come from either side, and are
-        off by their play.
+        holds the signs of the preceding moves; without it, and where it is 0, joints come from
+        either side, and are off by their play.
         """
-        known = _from_either_side(model, square) if approach is None else square
+        play, sizes = _play_of(model)
+        either = np.diag(square)[play] + sizes**2
         found = [
-            own @ known @ np.swapaxes(own, 1, 2)
-            + sum(off @ np.swapaxes(off, 1, 2) for off in rest)
-            for own, *rest in self._seen(model, joints, approach)
+            own @ square @ np.swapaxes(own, 1, 2)
+            + (sided * either) @ np.swapaxes(sided, 1, 2)
+            + off @ np.swapaxes(off, 1, 2)
+            for own, sided, off in self._seen(model, joints, approach)
         ]
         return np.concatenate(found)
 
@@ -99,12 +101,12 @@ class Unmodelled(NamedTuple):
 
         By the uncertainty of the parameters, by fitted play from either side, and by the rest.
         """
-        square, found = square if approach is not None else _from_either_side(model, square), []
-        for own, *rest in self._seen(model, joints, approach):
-            rows = own[:, part]
+        (play, sizes), found = _play_of(model), []
+        for own, sided, off in self._seen(model, joints, approach):
+            rows, squares = own[:, part], (sided[:, part] ** 2).sum(axis=1)
             along = (rows.reshape(-1, len(square)) @ square).reshape(rows.shape)
-            beyond = [(off[:, part] ** 2).sum(axis=(1, 2)) for off in rest]
-            found.append([np.einsum('ncp,ncp->n', along, rows), *beyond])
+            known = np.einsum('ncp,ncp->n', along, rows) + squares @ np.diag(square)[play]
+            found.append([known, squares @ sizes**2, (off[:, part] ** 2).sum(axis=(1, 2))])
         return np.concatenate(found, axis=1)
 
     def _seen(
@@ -112,30 +114,29 @@ class Unmodelled(NamedTuple):
     ) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
         """Yield the columns (B, 6, P) of a model, of its play, and of the joints, in blocks.
 
-        Its play is as fitted; there is none if the `approach` is known.
+        Play has a column of its own where its side is not known, and one of the model where it is.
         """
         chain, count, some = model.chain, len(model.names), any(self.sizes.values())
-        known = dict(chain.effects) if approach is None else {}
-        play = {k: known[n] for k, n in enumerate(model.names) if n in known and _is_play(n)}
+        play, _ = _play_of(model)
+        driven = [chain.joint_names.index(Parameter(model.names[k]).owner) for k in play]
         every = tuple(dict.fromkeys((*model.names, *(axis_parameters(chain) if some else ()))))
         joints, model = chain.joint_values(joints), ErrorModel(chain, every, *model.ends)
-        signs = np.ones_like(joints) if approach is None else approach
+        signs = np.zeros_like(joints) if approach is None else approach
         for first in range(0, max(len(joints), 1), BLOCK):
             block = np.s_[first : first + BLOCK]
-            jacobian = model.jacobian(joints[block], signs[block])
+            unknown = signs[block] == 0.0
+            jacobian = model.jacobian(joints[block], np.where(unknown, 1.0, signs[block]))
             off = self.columns(chain, every, joints[block], jacobian.T) if some else jacobian.T[:0]
-            either = jacobian[..., [*play]] * [*play.values()]
-            yield jacobian[..., :count], either, off.T
+            sided = jacobian[..., play] * unknown[:, np.newaxis, driven]
+            jacobian[..., play] -= sided
+            yield jacobian[..., :count], sided, off.T
 
 
-def _from_either_side(model: ErrorModel, square: FloatArray) -> FloatArray:
-    """Return expected squares (P, P) for random signs of moves: nothing else goes with play."""
-    rest = np.array([not _is_play(name) for name in model.names], dtype=bool)
-    return np.asarray(square * (np.outer(rest, rest) | np.eye(len(rest), dtype=bool)))
-
-
-def _is_play(name: str) -> bool:
-    return Parameter(name).kind in PLAY
+def _play_of(model: ErrorModel) -> tuple[list[int], FloatArray]:
+    """Return the numbers (K,) of the parameters that are play, and their values (K,)."""
+    known = dict(model.chain.effects)
+    play = [k for k, name in enumerate(model.names) if Parameter(name).kind in PLAY]
+    return play, np.array([known[model.names[k]] for k in play])
 
 
 NOTHING = Unmodelled()
