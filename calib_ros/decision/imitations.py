@@ -48,7 +48,8 @@ class Imitation:
         self._names = np.array(names)
         self._frames = np.array([chain.owns_frame(name) for name in names])
         self._offsets = np.append(fitted.offsets, np.zeros(len(names) - len(fitted.names)))
-        self._variance = max(fitted.size, ROUNDING) ** 2
+        turned = fitted.noise.orientation or 0.0  # beside too large a sigma of positions
+        self._variance = max(fitted.size, turned, ROUNDING) ** 2
         self._matrix, self._vector = about_nominal(products / self._variance, self._offsets)
         typical = np.array([TYPICAL[g] if g else np.inf for g in self._groups])
         matrix = self._matrix + np.diag(self._given + typical**-2.0)

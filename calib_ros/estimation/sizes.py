@@ -124,10 +124,13 @@ class Evidence:
     ) -> tuple[float, FloatArray, FloatArray]:
         """Return the log odds against the usual evidence at log sizes (G,); mean (P,), covariance.
 
-        The most probable sizes are searched anew.
+        The most probable sizes are searched anew; those found may also be likelier by the usual.
         """
         found, _ = self.most_probable(considered)
-        odds = self._probable(found) - usual._probable(size)
+        alike = copy.copy(usual)
+        alike._tails = self._tails[: len(usual._tails)]
+        usually = max(usual._probable(size), alike._probable(found[: len(size)]))
+        odds = self._probable(found) - usually
         precision = self.widened(found).precision(found)
         mean, root = solved(self._matrix, self._vector, precision)
         return odds, mean, root @ root.T
