@@ -172,7 +172,8 @@ def _region(
     finer = SCALE if printed else EXCEPTION * SCALE  # as of a tracker
     doubtful = inference.strained or not 0.0 < problem.sigma_scale <= finer
     if region is None and posterior.scale and doubtful:
-        checked = replace(fitted, problem=replace(problem, sigma_scale=finer))
+        robust = replace(fitted.robust, system=replace(fitted.system, sigma_scale=finer))
+        checked = replace(fitted, problem=replace(problem, sigma_scale=finer), robust=robust)
         known = replace(inference, fitted=checked, strained=False).with_mixture(posterior)
         if of(known.widened(wider)) is not None:
             return None, posterior.scale
