@@ -311,6 +311,9 @@ def _sigmas(problem: Problem, result: Identification) -> str:
     best, judged = 1e3 * EXCEPTION * TYPICAL['length'], result.validation
     computed = judged is not None and judged.figures[0].rms_mm < best
     moved = result.step is not None and result.step.harmful  # and may have turned
+    turned = 0.0 if moved or noise.orientation is None else noise.orientation
+    wide = turned > 1.0 > CLEARLY * noise.position
+    outweighed = wide or turned > CLEARLY * max(noise.position, 1.0)
     for k, (what, unit, size, most) in enumerate(kinds):
         if size is None:
             continue
@@ -327,10 +330,12 @@ def _sigmas(problem: Problem, result: Identification) -> str:
             if computed:
                 asked = 'no arm is as good: did its controller compute the poses?'
             found.append(f'{name}, and only {left}: {asked}')
-        elif k and not moved and size > CLEARLY * max(noise.position, 1.0) and size * given < most:
+        elif outweighed and wide == (k == 0) and size * given < most:
+            better = f'{"larger" if k else "smaller"} covariances'
+            better = better if own else f'sigma_{what} to {size * given:.2g}'
             found.append(
-                f'{name}, but {left}: the orientations outweigh the positions and spoil them; set '
-                f'{"larger covariances" if own else f"sigma_orientation to {size * given:.2g}"}'
+                f'{name}, {"but" if k else "and only"} {left}: the orientations outweigh the '
+                f'positions and spoil them; set {better}'
             )
     return '; '.join(found)
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E as UR, measured_arm
+from fits import NOISE, SIGMAS, UR10E as UR, arm, measured_arm
 from scipy import stats
 
 from calib_ros.apply.simulation import measure
@@ -23,6 +23,22 @@ from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.lens import Lens
+
+
+@pytest.mark.parametrize('seed', [0, 10])
+def test_positions_that_count_too_little_are_named_and_no_joint_is_blamed(seed):
+    """Motion capture, its sigma ten times its noise: a joint seemed to slip by 1 mrad."""
+    rng, true = np.random.default_rng(seed), arm(seed)
+    q = UR.random_joints(60, rng)
+    seen = measure(true, q[np.argsort(q[:, 1])], rng, 2.5e-4, 1e-3)
+    result = identify(Problem(UR, seen, sigma_position=2.5e-3))
+    assert result.step is None
+    said = (*result.refusals, *result.remarks)[0 if result.refusals else -1]
+    value = float(said.rpartition('spoil them; set sigma_position to ')[2])
+    assert value == pytest.approx(2.5e-4, rel=0.2)
+    mended = identify(Problem(UR, seen, sigma_position=value))
+    assert mended.accepted
+    assert not any('sigma' in each for each in mended.remarks)
 
 
 @pytest.mark.parametrize(('joint', 'off'), [(2, 0.02), (2, 0.008), (0, 0.02)])
