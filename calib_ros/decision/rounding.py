@@ -7,11 +7,12 @@ docs/model.md (Judgement) gives the reasons.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy import special
 
+from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.levels import CERTAIN, CLEARLY, CONFIDENT
 from calib_ros.estimation.observations import SOME_POSES
@@ -51,6 +52,40 @@ def rounded_joints(problem: Problem) -> dict[str, float]:
     return found
 
 
+def lost_digits(problem: Problem, chain: Chain) -> dict[str, float]:
+    """Return the joints whose values have lost all decimals, with the step [rad or m].
+
+    Poses may be meant to be at whole degrees: most residuals of the fitted chain must be turns of
+    the joint, as large as those by rounding.
+    """
+    sets, found = [each.spread() for each in problem.sets], dict[str, float]()
+    joints = np.concatenate([each.joints for each in sets]).T
+    for joint, q in zip(chain.joints, joints, strict=True):
+        for step in (float(np.deg2rad(1.0)), 0.1):
+            if resolution_of(q, (step,)):
+                rows = problem.system(sets).rows_of(chain, [joint.driven])
+                along = np.concatenate([(column * left).sum(axis=0) for column, left in rows])
+                squares = np.concatenate([(each**2).sum(axis=1) for each in rows], axis=1)
+                column, left = np.maximum(squares, 1e-300)
+                turned = np.median(np.abs(along) / column) > step / 8.0  # by rounding: a quarter
+                if turned and np.median(along**2 / (column * left)) > 0.5:
+                    found[joint.name] = step
+    return found
+
+
+def with_lost_digits(
+    refused: tuple[Reason, ...], lost: Mapping[str, float], chain: Chain
+) -> tuple[Reason, ...]:
+    """Return the refusals, if any, after the joints that have only whole steps [rad or m] left."""
+    units = {joint.name: joint.driven.unit for joint in chain.joints}
+    each = [f'{name} ({resolution_in_words(size, units[name])})' for name, size in lost.items()]
+    text = (
+        f'most errors of the poses are those of {", ".join(each)}, whose values have lost their '
+        'decimals: record all digits'
+    )
+    return (Reason(Rule.MISTAKE, text),) * bool(lost and refused) + refused
+
+
 def resolution_in_words(step: float, unit: str) -> str:
     """Return a step of rounded values [rad or m] in the unit in which they were written."""
     degrees = round(float(np.rad2deg(step)), 3)
@@ -74,21 +109,20 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
     return found
 
 
-def error_by_rounding(problem: Problem) -> float:
-    """Return the RMS position error [m] of the flange that rounded joint values cause."""
-    joints, chain = np.concatenate([each.spread().joints for each in problem.sets]), problem.chain
-    squares = 0.0
-    for name, step in rounded_joints(problem).items():
+def error_by_rounding(problem: Problem, chain: Chain) -> float:
+    """Return the RMS position error [m] of the fitted flange that rounded joint values cause."""
+    joints, squares = np.concatenate([each.spread().joints for each in problem.sets]), 0.0
+    for name, step in (rounded_joints(problem) | lost_digits(problem, chain)).items():
         moved = joints + step * (np.array(chain.joint_names) == name)
         shift = (chain.forward(moved) - chain.forward(joints))[:, :3, 3]
         squares += float(np.mean(np.sum(shift**2, axis=-1))) / 12.0
     return float(np.sqrt(squares))
 
 
-def resolution_of(values: FloatArray) -> float:
+def resolution_of(values: FloatArray, steps: Sequence[float] = RESOLUTIONS) -> float:
     """Return the step [rad or m] of which values (N,) are multiples; 0 for none."""
-    few = values[:3, np.newaxis] / RESOLUTIONS
-    likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < ROUNDED, RESOLUTIONS).tolist()
+    few = values[:3, np.newaxis] / steps
+    likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < ROUNDED, steps).tolist()
     for step in sorted(likely, reverse=True):
         if _are_multiples(values, step):
             wider = _are_multiples(values, CLEARLY * step)

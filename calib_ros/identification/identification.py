@@ -24,7 +24,13 @@ from calib_ros.decision.misfits import arms_own, coupling_share, outliers_of
 from calib_ros.decision.region import Region
 from calib_ros.decision.result import Identification
 from calib_ros.decision.risk import region_of
-from calib_ros.decision.rounding import may_be_rounding, rounded_joints, rounding_errors
+from calib_ros.decision.rounding import (
+    lost_digits,
+    may_be_rounding,
+    rounded_joints,
+    rounding_errors,
+    with_lost_digits,
+)
 from calib_ros.decision.steps import find_step
 from calib_ros.decision.strain import strain_of
 from calib_ros.decision.validation import held_out_excess, validate
@@ -87,7 +93,8 @@ def _identified(
     explained = simpler.validation.judged if simpler and simpler.validation else None
     progress(2 / 3)
     validation, validated_by = validate(fitted, before.chain, explained)
-    coarse, by_couplings = rounded_joints(problem), coupling_share(fitted)
+    by_couplings, lost = coupling_share(fitted), lost_digits(problem, chain)
+    coarse = rounded_joints(problem) | lost
     more = considered(chain, names, problem.fixed, problem.sets)
     (strain, by_strain), rounding = strain_of(fitted), rounding_errors(problem, coarse)
     # of the least noise couplings are a part: they are no strain
@@ -129,10 +136,10 @@ def _identified(
         strain=strain,
         images=sum(count_distinct(s.images) for s in problem.sets if s.pixels is not None),
     )
-    own_behaviour = None if step and not step.slow else arms_own(fitted)
-    by_rounding = may_be_rounding(fitted, before.chain, coarse)
-    refused = refusals(problem, result, own_behaviour, by_rounding, fitted.held is None, scaled)
-    result = replace(result, refusals=(*result.refusals, *refused))
+    own = None if step and not step.slow else arms_own(fitted)
+    verdicts = own, may_be_rounding(fitted, before.chain, coarse), fitted.held is None, scaled
+    refused = with_lost_digits(refusals(problem, result, *verdicts), lost, chain)
+    result = replace(result, refusals=wrong + refused)
     named = mistakes.with_mistake(problem, result)
     return plausibility.add_remarks(problem, named, another=named is result)
 

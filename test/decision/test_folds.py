@@ -12,7 +12,12 @@ from test_steps import NOISE, SIGMAS, UR10E, arm, poses
 from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.decision import rounding
 from calib_ros.decision.reasons import Rule
-from calib_ros.decision.rounding import resolution_in_words, rounded_joints, rounding_errors
+from calib_ros.decision.rounding import (
+    lost_digits,
+    resolution_in_words,
+    rounded_joints,
+    rounding_errors,
+)
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.observations import numbered
@@ -172,6 +177,22 @@ def test_two_values_of_each_joint_tell_a_step_together(step, rng):
         q = step * np.round(q / step) if told else q  # else multiples of 30 degrees
         found = rounded_joints(Problem(UR10E, measure(UR10E, q, rng)))
         assert found == (dict.fromkeys(UR10E.joint_names, step) if told else {})
+
+
+@pytest.mark.parametrize('step', [np.deg2rad(1.0), 0.1])
+def test_a_joint_that_lost_its_decimals_is_told_first(step, rng):
+    """It seemed to slip by 5.5 mrad."""
+    true = arm(3)
+    q = UR10E.random_joints(40, rng)
+    meant = step * np.round(q / step)
+    right = Problem(UR10E, measure(true, meant, rng, 1e-4, 3e-4))
+    lost = np.where(np.arange(6) == 1, meant, q)
+    problem = Problem(UR10E, replace(measure(true, q, rng, 1e-4, 3e-4), joints=lost))
+    assert lost_digits(right, true) == {}  # whole degrees of all joints, and they are reached
+    assert lost_digits(problem, true) == {'shoulder_lift_joint': pytest.approx(step)}
+    first = identify(problem).refusals[0]
+    assert first.rule is Rule.MISTAKE
+    assert first.startswith('most errors of the poses are those of shoulder_lift_joint (1')
 
 
 def test_a_step_is_told_in_the_unit_of_the_file():
