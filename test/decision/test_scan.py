@@ -57,6 +57,15 @@ def test_gross_errors_here_and_there_are_no_move_of_a_healthy_arm(seed):
     assert find_step(bumped(0.0, 0.0, seed=seed, oriented=False, gross=4)) is None
 
 
+@pytest.mark.parametrize(('seed', 'row'), [(1, 1), (2, 38)])
+def test_a_gross_error_near_an_end_is_no_move_there(seed, row):
+    """A frame of a few positions explains one of them, however far off it is."""
+    rng = np.random.default_rng([seed, row])
+    *_, seen = measured_arm(seed, 40, oriented=False)
+    seen.positions[row] += 0.05 / 3.0**0.5 * rng.normal(size=3)
+    assert find_step(fitting.fit(Problem(UR10E, seen, **SIGMAS))) is None
+
+
 @pytest.mark.parametrize('count', [6, 30, 400])
 def test_the_coarse_search_is_a_tenth_of_the_shorter_side_apart(count):
     some = scan._some_places(count)
