@@ -136,18 +136,20 @@ class Clocks:
     def find(self, collector: Collector, now_ns: int | None) -> None:
         """Estimate the delay for a collector, at intervals until it is clear.
 
-        Nothing is sampled before; at the end (None) the data so far must do. Ambiguous delays are
-        not used.
+        Nothing is sampled before, nor for WATCH_NS while it is known roughly; at the end (None)
+        the data so far must do. Ambiguous delays are not used.
         """
         if not collector.holding:
             return
         if now_ns is not None and 0 <= now_ns - self._searched_ns < 1e9 * LEAST_MOTION:
             return
         self._searched_ns = now_ns or 0
-        self._found = self._delay_of(*collector.recent_series(now_ns))
+        joints, streams = collector.recent_series(now_ns)
+        self._found, rough = self._delay_of(joints, streams), True
         if self.delay is not None:
             collector.delay_ns = round(self.delay.seconds * 1e9)
-        collector.holding = self.delay is None and now_ns is not None
+            rough = self.delay.within > SMOOTHING and bool(np.ptp(joints[0]) < WATCH_NS)
+        collector.holding = rough and now_ns is not None
 
     def _delay_of(self, joints: Series, streams: Sequence[Series]) -> Delay | None:
         """Return the delay of poses, by the stream that shows it best.

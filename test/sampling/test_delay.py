@@ -75,6 +75,12 @@ def test_the_delay_is_fitted_where_it_was_given_wrong():
     assert error(result.chain, true, motion) < NOISE[0]
 
 
+def test_a_delay_that_little_motion_tells_roughly_is_looked_for_in_more():
+    _, moving, _ = true_cell(0)
+    session, *_ = recorded(0.2, oriented=False, motion=lambda times: moving(0.4 * times))
+    assert session.delay.seconds == pytest.approx(0.2, abs=2e-2)
+
+
 def test_without_motion_there_is_no_delay():
     still, *_ = recorded(0.1, seconds=10.0, motion=stops(np.array([[0, -1.2, 1.2, -1, 1, 0.0]])))
     assert still.delay is None
