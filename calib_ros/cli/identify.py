@@ -279,7 +279,7 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
 
 
 def _rows(result: Identification) -> dict[str, str]:
-    judged, effects = result.validation or result.fitted, len(result.chain.effects)
+    judged, effects = result.comparison, len(result.chain.effects)
     before, after = figures = judged.figures
     fitted, measured = f'{result.rank} parameters fitted', words.fitted_to(result)
     if effects:

@@ -81,7 +81,7 @@ def unsteady(result: Identification) -> tuple[str, bool]:
     lacking, typical = result.posterior.unmodelled, TYPICAL['angle']
     if not (lacking.random and lacking.turns > typical):
         return '', False
-    before, after = (result.validation or result.fitted).figures
+    before, after = result.comparison.figures
     slight = before.rms_mm < ALIKE * after.rms_mm and lacking.turns > typical / NEARER
     text = (
         f'joints seem off by {1e3 * lacking.turns:.2g} mrad at random, from pose to pose: the arm '

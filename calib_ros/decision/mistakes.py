@@ -91,7 +91,7 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
     """
     if not result.converged or (not result.refusals and result.coupled):
         return True
-    judged, most = result.validation or result.fitted, position_fault_limit(problem)
+    judged, most = result.comparison, position_fault_limit(problem)
     for each in (*judged.figures_of_all, result.fitted.figures_of_all[0]):
         error, angle = 1e-3 * each.rms_mm, 1e-3 * (each.rms_mrad or 0.0)
         if error > most or angle > problem.largest_angle:

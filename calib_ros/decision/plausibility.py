@@ -168,7 +168,7 @@ def _level_hand(problem: Problem, result: Identification) -> str:
     joints = np.concatenate([each.spread().joints for each in problem.sets])
     *_, tilted = best_imitation(result.chain, frames, along, joints, 0.0)
     off = LEVER * np.linalg.norm(tilted) / np.sqrt(len(joints))
-    left = 1e-3 * (result.validation or result.fitted).figures[1].rms_mm
+    left = 1e-3 * result.comparison.figures[1].rms_mm
     if off < max(left, SIMULATED):
         return ''
     there = [f'{n}, taken as {round(result.chain.value(n), 3) + 0.0:g}' for n in sorted(hidden)]

@@ -103,6 +103,11 @@ class Identification(Shown):
         return self.uncertainty.covariance
 
     @property
+    def comparison(self) -> Comparison:
+        """Return the residuals of the held-out pairs, or of the fitted ones if there are none."""
+        return self.validation or self.fitted
+
+    @property
     def contradiction(self) -> str:
         """Return how far held-out poses are off, if clearly further than expected."""
         return bool(self.surprise) * (
@@ -183,7 +188,7 @@ class Identification(Shown):
         )
 
     def _repr_html_(self) -> str:
-        before, after = (self.validation or self.fitted).figures
+        before, after = self.comparison.figures
         rows = [('parameter', 'offset [mm, mrad]', '± (95 %)')]
         rows += [
             (str(p.name), f'{1e3 * p.offset:+.4f}', f'{1e3 * (p.half_width() or 0.0):.4f}')

@@ -24,7 +24,7 @@ def result_row(result: Identification, about: Filing, warnings: Sequence[str] = 
     """Return the row of an identification; `warnings` are of the measurements."""
     offsets = {str(each.name): each.offset for each in result.parameters}
     names = tuple(map(str, result.names))
-    which = result.validation or result.fitted
+    which = result.comparison
     freedom = result.uncertainty.overall
     return Row(
         **asdict(about),

@@ -105,7 +105,7 @@ class Calibration(Shown):
 
         `verify` recognises the `fitted` ones, and cannot pass on them.
         """
-        before, after = (result.validation or result.fitted).figures
+        before, after = result.comparison.figures
         region, noise, owners = result.region, result.noise, owners or {}
         rms_mm = round(after.rms_mm, 6)  # as in the file
         record = {

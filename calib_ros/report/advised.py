@@ -51,7 +51,7 @@ def advice_of(problem: Problem, result: Identification) -> tuple[Advice, ...]:
     marks |= {'no_linear': all(joint.driven.unit == 'rad' for joint in problem.chain.joints)}
     marks |= {'zeros': zeros, 'lengths': not zeros}
     needless = tuple(mark for mark, holds in marks.items() if holds)
-    remains = (judged or result.fitted).figures[1].rms_mm
+    remains = result.comparison.figures[1].rms_mm
     rounded_by = 1e3 * error_by_rounding(problem, result.chain)
     rounding = rounded_by if 2.0 * rounded_by > remains else 0.0
     about = words.drifts(result.noise), len(result.outliers), contradicted, needless, rounding

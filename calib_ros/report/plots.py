@@ -24,7 +24,7 @@ MARGIN = 0.01  # free margin around a board [m]; a convention
 
 def before_after_png(result: Identification) -> bytes:
     """Return the figure of held-out position errors before and after."""
-    comparison = result.validation or result.fitted
+    comparison = result.comparison
     before, after = (
         1e3 * np.linalg.norm(residuals.position[comparison.deciding], axis=1)
         for residuals in (comparison.before, comparison.after)

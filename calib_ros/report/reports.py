@@ -58,7 +58,7 @@ def identification_report(
     poses: Poses | None = None,
 ) -> Report:
     """Return the report of an identification; `wanted_mm` is the wanted RMS error."""
-    problem, judged = loaded.problem, result.validation or result.fitted
+    problem, judged = loaded.problem, result.comparison
     poses = poses or poses_of(problem, result, loaded.by_line, loaded.images)
     reasons = advice_of(problem, result)
     text = filter(None, _text(result, reasons, wanted_mm))
@@ -113,14 +113,14 @@ def result_standing(
 ) -> Headline:
     """Return the verdict as a reader sees it first: an arm without visible errors is not bad."""
     if result.accepted:
-        within, sure = _within(result.validation or result.fitted, wanted_mm)
+        within, sure = _within(result.comparison, wanted_mm)
         open_yet = not sure or bool(result.remarks)
         whole = result.region is None or result.region.whole
         heading = f'Accepted{"" if whole else " near the measured poses"}{within}'
         heading += ': check first' * bool(result.remarks)
         return Headline('open' if open_yet else 'good', heading)
     if good := _sound(reasons):
-        within, _ = _within(result.validation or result.fitted, wanted_mm, 0)
+        within, _ = _within(result.comparison, wanted_mm, 0)
         return Headline('info', f'{good}{within}: the robot stays as it was')
     return Headline('bad', 'Not accepted: the robot stays as it was')
 
@@ -133,7 +133,7 @@ def _text(
         how = 'Each pose is judged by a fit without it' if result.accepted else 'The arm as it is'
         whole = ' The whole interval must be within the tolerance.' * (wanted_mm is not None)
         yield f'{how}; 95 % interval in brackets.{whole}'
-        if count := (result.validation or result.fitted).outliers:
+        if count := result.comparison.outliers:
             yield f'{counted(count, "outlier")}, listed below: not in these figures.'
     if result.accepted:
         yield from doubts(result)
@@ -182,7 +182,7 @@ def _steps(
 ) -> tuple[str, ...]:
     if not result.accepted:
         return () if _sound(reasons) else (reasons[0].again,)
-    interval = interval_of(result.validation or result.fitted, 1)
+    interval = interval_of(result.comparison, 1)
     verdict = '' if wanted_mm is None else compared(1e-3 * wanted_mm, *interval)
     whole = result.region is None or result.region.whole
     found = {

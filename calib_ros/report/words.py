@@ -70,7 +70,7 @@ def verdict(result: Identification) -> str:
 
 
 def _figures(result: Identification) -> str:
-    figures = (result.validation or result.fitted).figures
+    figures = result.comparison.figures
     text = f'{fitted_data(result)}, {rms_change(figures)}'
     if likely := rms_range_mm(result.validation, 1):
         text += f' (95 %: {likely} mm)'
@@ -145,7 +145,7 @@ def notes(result: Identification) -> list[str]:
 
 def error_meaning(result: Identification) -> str:
     """Return what errors of distances, planes and corners mean; empty for positions alone."""
-    position = (result.validation or result.fitted).after.position
+    position = result.comparison.after.position
     if (np.abs(position[:, 0]) > SAME)[~position[:, 1:].any(axis=1)].any():
         return (
             'errors of distances and touched planes are along one direction: position errors in '

@@ -42,7 +42,7 @@ def test_a_row_comes_back_as_it_was_filed(result, tmp_path):
     for each in fields(Row):
         np.testing.assert_array_equal(getattr(found, each.name), getattr(filed, each.name))
     assert found.accepted
-    assert found.rms_mm == (result.validation or result.fitted).figures[1].rms_mm
+    assert found.rms_mm == result.comparison.figures[1].rms_mm
     assert found.lower_mm < found.rms_mm < found.upper_mm
     np.testing.assert_array_equal(found.covariance, result.covariance)
     joints = CHAIN.random_joints(5, np.random.default_rng(0))
