@@ -95,7 +95,7 @@ class Keeper:
         self._adopted(calibration, self._world(calibration))
 
     def save(self) -> Job:
-        """Return how the calibration, to `target_filename` as it is now, is saved."""
+        """Return what saves the calibration, to `target_filename` as it is now."""
         if not self._published.text:
             raise InputError(
                 'there is no accepted calibration to save: ~/identify must accept one first'
@@ -146,7 +146,7 @@ class Keeper:
         return f'{path}, {calibration.whose}{lost}'
 
     def export(self) -> Job:
-        """Return how the calibration, checked at the samples, is written in all formats."""
+        """Return what writes the calibration in all formats, checked at the samples."""
         session = self._session
         if session.calibration is None:
             raise InputError('there is no calibration to export: call ~/identify or ~/load first')
