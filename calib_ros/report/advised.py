@@ -47,7 +47,8 @@ def advice_of(problem: Problem, result: Identification) -> tuple[Advice, ...]:
     marks = {'auto': result.verdicts, 'table': not problem.of_messages, 'no_wires': not wires}
     marks |= {'images': result.images, 'no_images': not result.images}
     sockets = [each.socket for each in problem.all_sets]
-    marks |= {'no_sockets': not any(sockets), 'no_device': result.images or all(sockets)}
+    alone = all(each.socket or each.pixels is not None for each in problem.all_sets)
+    marks |= {'no_sockets': not any(sockets), 'no_device': alone}
     marks |= {'no_linear': all(joint.driven.unit == 'rad' for joint in problem.chain.joints)}
     marks |= {'zeros': zeros, 'lengths': not zeros}
     needless = tuple(mark for mark, holds in marks.items() if holds)

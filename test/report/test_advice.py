@@ -133,9 +133,12 @@ def test_sockets_have_neither_temperature_nor_pressure(solved, sockets):
     problem, result = solved
     seen = replace(problem.observations, socket=sockets)
     refused = replace(result, refusals=(Reason(Rule.SCALE, 'lengths shrink'),))
-    (told,) = advice_of(replace(problem, observations=seen, held_out=None), refused)
-    steps = ' '.join(told.steps)
-    assert ('temperature' not in steps) == ('measure their distance' in steps) == sockets
+    for images in (0, 8):  # beside them
+        found = replace(refused, images=images)
+        (told,) = advice_of(replace(problem, observations=seen, held_out=None), found)
+        steps = ' '.join(told.steps)
+        assert ('temperature' not in steps) == ('measure their distance' in steps) == sockets
+        assert ('A printed board' in steps) == bool(images)
 
 
 @pytest.mark.parametrize('rule', [rule for rule in Rule if rule not in advice.TOLD_TWICE])
