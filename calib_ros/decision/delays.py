@@ -17,6 +17,7 @@ from typing import TypeAlias
 import numpy as np
 
 from calib_ros.decision.result import Identification
+from calib_ros.decision.rounding import rounded_joints
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.gain import gain_share
 from calib_ros.estimation.levels import ALIKE, NEARER, TELLING
@@ -72,14 +73,16 @@ def uneven(problem: Problem, result: Identification) -> tuple[str, Problem] | No
     return text, problem.with_sets(sets)
 
 
-def unsteady(result: Identification) -> tuple[str, bool]:
+def unsteady(problem: Problem, result: Identification) -> tuple[str, bool]:
     """Return that joints seem to be off at random by more than arms are, and whether it is a lag.
 
     It is if some other reason refuses the result as well, or if that is more than any arm's play
-    and the correction lowers the error by less than a third.
+    and the correction lowers the error by less than a third. Rounded values are off like that.
     """
     lacking, typical = result.posterior.unmodelled, TYPICAL['angle']
-    if not (lacking.random and lacking.turns > typical):
+    steps = rounded_joints(problem).values()
+    rounding = np.sqrt(sum(step**2 for step in steps) / 12.0 / len(problem.chain.joints))
+    if not (lacking.random and lacking.turns > max(typical, ALIKE * rounding)):
         return '', False
     before, after = result.comparison.figures
     slight = before.rms_mm < ALIKE * after.rms_mm and lacking.turns > typical / NEARER

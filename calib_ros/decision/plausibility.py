@@ -225,7 +225,7 @@ def _lag(problem: Problem, result: Identification) -> Identification:
         found = _stop_lag(problem, result)
     else:
         found = uneven(problem, result)
-    text, harmful = unsteady(result)
+    text, harmful = unsteady(problem, result)
     if found is not None:
         text, other = found
         harmful = other is not None and _imitated(other, result)
