@@ -56,9 +56,13 @@ def lost_digits(problem: Problem, chain: Chain) -> dict[str, float]:
     """Return the joints whose values have lost all decimals, with the step [rad or m].
 
     Poses may be meant to be at whole degrees: most residuals of the fitted chain must be turns of
-    the joint, as large as those by rounding.
+    the joint, as large as those by rounding. By chance half of those in images are, and distances
+    always.
     """
-    sets, found = [each.spread() for each in problem.sets], dict[str, float]()
+    sets = [each.spread() for each in problem.sets if each.distances is None]
+    found = dict[str, float]()
+    if not sets:
+        return found
     joints = np.concatenate([each.joints for each in sets]).T
     for joint, q in zip(chain.joints, joints, strict=True):
         for step in (float(np.deg2rad(1.0)), 0.1):
@@ -68,7 +72,7 @@ def lost_digits(problem: Problem, chain: Chain) -> dict[str, float]:
                 squares = np.concatenate([(each**2).sum(axis=1) for each in rows], axis=1)
                 column, left = np.maximum(squares, 1e-300)
                 turned = np.median(np.abs(along) / column) > step / 8.0  # by rounding: a quarter
-                if turned and np.median(along**2 / (column * left)) > 0.5:
+                if turned and np.median(along**2 / (column * left)) > 0.75:
                     found[joint.name] = step
     return found
 

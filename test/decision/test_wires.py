@@ -12,6 +12,7 @@ from in_sockets import cell
 
 from calib_ros import Chain, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision.rounding import lost_digits
 from calib_ros.decision.wires import wrong_distances
 from calib_ros.estimation.fitting import fit
 from calib_ros.kinematics.chain import Frame, Joint
@@ -41,6 +42,15 @@ def over_a_pulley(cable, radius):
     away = np.hypot(far, up)
     wrapped = np.pi - np.arctan2(up, far) - np.arccos(radius / away)
     return np.sqrt(away**2 - radius**2) + radius * wrapped
+
+
+def test_whole_degrees_that_were_reached_are_no_lost_decimals():
+    """A distance is always a turn of a joint: wrists near the target had lost their decimals."""
+    rng, true, _ = measured_arm(1, 1)
+    q = np.deg2rad(np.round(np.rad2deg(UR10E.random_joints(60, rng))))
+    seen = measure(true, q, rng, 2e-4, oriented=False)
+    seen = replace(seen, distances=norms(seen.positions))
+    assert lost_digits(Problem(UR10E, seen), true) == {}
 
 
 @pytest.mark.parametrize(

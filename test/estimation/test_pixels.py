@@ -16,6 +16,7 @@ from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.apply.camera import Camera, before_camera, photograph
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.mistakes import diagnose
+from calib_ros.decision.rounding import lost_digits
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.normal import products_of
 from calib_ros.estimation.pixels import PixelSamples, seen_residuals
@@ -230,6 +231,13 @@ def test_pixels_and_poses_in_one_fit(rng):
     assert both.accepted, both.refusals
     assert both.rank == 30 + 6 + 6
     assert rms(both.chain, tracked, JOINTS) < rms(alone.chain, tracked, JOINTS)
+
+
+def test_whole_degrees_that_were_reached_are_no_lost_decimals_in_images():
+    true, seen = scene(1, False, noise=1.0)  # half of it is a turn of any joint, by chance
+    whole = replace(seen, joints=np.deg2rad(np.round(np.rad2deg(seen.joints))))
+    moved = seen_residuals(true, seen)[0] - seen_residuals(true, whole)[0]
+    assert not lost_digits(Problem(known(False), replace(whole, pixels=seen.pixels + moved)), true)
 
 
 def test_held_out_images_judge_in_pixels_and_millimetres():
