@@ -48,7 +48,8 @@ class Imitation:
         self._names = np.array(names)
         self._frames = np.array([chain.owns_frame(name) for name in names])
         self._offsets = np.append(fitted.offsets, np.zeros(len(names) - len(fitted.names)))
-        turned = fitted.noise.orientation or 0.0  # beside too large a sigma of positions
+        noise = fitted.noise  # beside too large a sigma of positions, that of orientations counts
+        turned = 0.0 if noise.position > 1.0 else noise.orientation or 0.0
         self._variance = max(fitted.size, turned, ROUNDING) ** 2
         self._matrix, self._vector = about_nominal(products / self._variance, self._offsets)
         typical = np.array([TYPICAL[g] if g else np.inf for g in self._groups])
