@@ -238,6 +238,14 @@ def test_a_file_whose_keys_were_sorted_is_the_same_calibration(found):
     assert [*read.chain.effects] == sorted(found.chain.effects) != [*found.chain.effects]
 
 
+def test_effects_that_were_held_may_stand_before_those_fitted():
+    """The file was said to be edited: the region lists what was held last."""
+    *_, seen = measured_arm(0, 40, (1e-4, 3e-4))
+    result = identify(Problem(UR, seen, effects=('ratio',), fixed=('shoulder_pan_joint.ratio',)))
+    read = parse_calibration(Calibration.of(result).dump(), 'c.yaml', UR)
+    assert read.chain.effects == result.chain.effects
+
+
 def test_a_nominal_chain_with_other_effects_is_another(document):
     text = yaml.safe_dump(document, sort_keys=False)
     parse_calibration(text, 'c.yaml', UR.with_effect_values({'elbow_joint.ratio': 0.0}))
