@@ -4,10 +4,11 @@
 
 The speed of the target by joints and chain and the speed by the measurements are the same signal.
 Angular speed depends on no frame; linear speed is that of the flange, close enough to the target's
-for a start. Then the velocity of the target, in the axes of the device, is a sum of those of the
-flange and of the axes there: of the lags that speeds do not tell apart, that with the least rest
-of this linear fit. The best lag is refined by a parabola; in motion the identification then fits
-the rest as a parameter (`base.delay`).
+for a start. The velocity of the target, in the axes of the device, is a sum of those of the flange
+and of the axes there: the delay leaves the least rest of this linear fit, of the lags at which
+each half of the motion tells the other, or, if none do, of those that speeds do not tell apart.
+The best lag is refined by a parabola; in motion the identification then fits the rest as a
+parameter (`base.delay`).
 """
 
 from __future__ import annotations
@@ -81,23 +82,27 @@ def find_delay(
         return None
     poses = chain.forward(joints[nearest])
     turns = None if rotations is None else poses[:, :3, :3]
-    by_joints = np.interp(grid, *_speed(joint_times[nearest], poses[:, :3, 3], turns))
+    flange = _rates(joint_times[nearest], poses[:, :3].reshape(-1, 12))
+    middle, rates = _rates(joint_times[nearest], poses[:, :3, 3], turns)
+    by_joints = np.interp(grid, middle, se3.norms(rates))
     moving = known_motion & (by_joints > EXCEPTION * np.percentile(by_joints, 95))
     if moving.sum() * STEP < LEAST_MOTION:
         return None
-    second = _speed(times, positions, rotations)
+    middle, rates = _rates(times, positions, rotations)
+    possible = se3.norms(rates) <= ALIKE * se3.norms(flange[1]).max()  # others were lost
+    if possible.mean() > 1.0 - MOST_OUTLIERS:  # else they are of other units
+        middle, rates = middle[possible], rates[possible]
     most = round(farthest / STEP)
     lags = STEP * np.arange(-most, most + 1)
     wide = begin + STEP * np.arange(-most, len(grid) + most)
-    known = int(np.sum(wide < second[0][0])), int(np.sum(wide <= second[0][-1]))
-    score = _correlations(by_joints, np.interp(wide, *second), known)
+    known = int(np.sum(wide < middle[0])), int(np.sum(wide <= middle[-1]))
+    score = _correlations(by_joints, np.interp(wide, middle, se3.norms(rates)), known)
+    if rotations is None:
+        places = np.flatnonzero(known_motion)
+        score = _fitted(score, places, _resampled(grid, *flange), _resampled(wide, middle, rates))
     best = int(np.argmax(score))
     if score[best] < ALIKE_ENOUGH or best in (0, len(lags) - 1):
         return None
-    if rotations is None:
-        flange = _rates(joint_times[nearest], poses[:, :3].reshape(-1, 12))
-        score = _fitted(score, grid[known_motion], flange, _rates(times, positions))
-        best = int(np.argmax(score))
     alike = _alike(score)
     left, middle, right = np.pad(score, 1)[best : best + 3]
     bend = left - 2.0 * middle + right
@@ -115,29 +120,43 @@ def _alike(score: FloatArray) -> Flags:
     return np.asarray(apart <= ALIKE * apart.min())
 
 
-def _fitted(score: FloatArray, grid: FloatArray, flange: Rates, target: Rates) -> FloatArray:
+def _fitted(
+    score: FloatArray, places: Index, flange: FloatArray, target: FloatArray
+) -> FloatArray:
     """Return the correlations (L,) of a target's velocities and those fitted to them by lag.
 
-    By the rates (N, 12) of position and axes of the flange at known times (T,). Lags whose speeds
-    are less alike, of the `score` (L,), count for nothing.
+    By the rates (N, 12) of position and axes of the flange, known at some places; those of the
+    target (N + L - 1, 3) are NaN where unknown. Lags where neither halves of the motion tell each
+    other nor speeds are alike, of the `score` (L,), count for nothing.
     """
-    times, seen = target
-    found = np.flatnonzero(_alike(score))
-    lags = STEP * (found - len(score) // 2)
-    inner = grid[(grid + lags[0] >= times[0]) & (grid + lags[-1] <= times[-1])]
-    if len(inner) * STEP < LEAST_MOTION:
-        return score
-    inner = inner[:: int(len(inner) * STEP / LEAST_MOTION)]
-    columns = np.array([np.interp(inner, flange[0], each) for each in flange[1].T]).T
-    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    basis = basis[:, sizes > DEGENERATE * sizes[0]]
-    at = inner[:, np.newaxis] + lags
-    moved = np.array([np.interp(at, times, each) for each in seen.T])
-    whole = (moved**2).sum(axis=(0, 1))
-    kept = (np.einsum('nk,cnl->kcl', basis, moved, optimize=True) ** 2).sum(axis=(0, 1))
-    fitted = np.full_like(score, -1.0)
-    fitted[found] = np.sqrt(kept / np.maximum(whole, 1e-300))
-    return fitted
+
+    def by_lag(lags: Index, parts: int) -> FloatArray:
+        found = np.full_like(score, -1.0)
+        ends = flange[places], target[places + lags[0]], target[places + lags[-1]]
+        inner = places[~np.isnan(sum(each[:, 0] for each in ends))]
+        if len(inner) * STEP < LEAST_MOTION:
+            return found
+        inner = inner[:: int(len(inner) * STEP / LEAST_MOTION)]
+        basis = np.linalg.svd(flange[inner], full_matrices=False)[0]
+        moved = target[inner[:, np.newaxis] + lags].reshape(len(inner), -1)
+        rest, unit = np.zeros(moved.shape[1]), np.eye(basis.shape[1])
+        pieces = np.array_split(np.arange(len(inner)), parts)
+        for judged, given in zip(pieces, pieces[::-1], strict=True):
+            matrix = basis[given].T @ basis[given] + DEGENERATE * unit
+            weights = np.linalg.solve(matrix, basis[given].T @ moved[given])
+            rest += ((moved[judged] - basis[judged] @ weights) ** 2).sum(axis=0)
+        whole = np.maximum((moved**2).sum(axis=0).reshape(-1, 3).sum(axis=1), 1e-300)
+        found[lags] = np.sqrt(np.maximum(1.0 - rest.reshape(-1, 3).sum(axis=1) / whole, 0.0))
+        return found
+
+    halves = by_lag(np.arange(len(score)), 2)
+    alike = _alike(halves)
+    if halves.max() ** 2 < 1.0 - EXCEPTION or alike[0] or alike[-1]:
+        if score.max() < ALIKE_ENOUGH or score.argmax() in (0, len(score) - 1):
+            return score
+        alike = _alike(score)
+    found = by_lag(np.flatnonzero(alike), 1)
+    return found if found.max() > 0.0 else score
 
 
 def peaks(score: FloatArray, rise: float) -> Index:
@@ -158,22 +177,18 @@ def peaks(score: FloatArray, rise: float) -> Index:
     return np.array(found, dtype=np.intp)
 
 
-def _speed(times: FloatArray, positions: FloatArray, rotations: FloatArray | None) -> Rates:
-    """Return times and speeds over SMOOTHING, angular if rotations (N, 3, 3) are given."""
-    if rotations is None:
-        middle, rates = _rates(times, positions)
-        return middle, np.linalg.norm(rates, axis=1)
-    first, last = _steps(times)
-    turn = np.swapaxes(rotations[first], 1, 2) @ rotations[last]
-    way = np.linalg.norm(se3.log_rotation(turn), axis=1)
-    return 0.5 * (times[first] + times[last]), way / (times[last] - times[first])
+def _resampled(grid: FloatArray, times: FloatArray, values: FloatArray) -> FloatArray:
+    """Return values (M, c) at other times (N,), NaN outside."""
+    return np.array([np.interp(grid, times, each, np.nan, np.nan) for each in values.T]).T
 
 
-def _rates(times: FloatArray, values: FloatArray) -> Rates:
-    """Return times and the rates (M, c) of values (N, c) over SMOOTHING."""
+def _rates(times: FloatArray, values: FloatArray, rotations: FloatArray | None = None) -> Rates:
+    """Return times and the rates (M, c) of values (N, c) over SMOOTHING, or angular velocities."""
     first, last = _steps(times)
-    rates = (values[last] - values[first]) / (times[last] - times[first])[:, np.newaxis]
-    return 0.5 * (times[first] + times[last]), rates
+    moved = values[last] - values[first]
+    if rotations is not None:
+        moved = se3.log_rotation(np.swapaxes(rotations[first], 1, 2) @ rotations[last])
+    return 0.5 * (times[first] + times[last]), moved / (times[last] - times[first])[:, np.newaxis]
 
 
 def _steps(times: FloatArray) -> tuple[Index, Index]:

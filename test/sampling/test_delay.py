@@ -3,6 +3,7 @@
 """A cell measured in motion by a device whose clock or transport is late."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -198,9 +199,10 @@ def test_stops_spoilt_by_a_delay_are_told(lag, settings, said):
     assert np.sqrt((errors**2).mean()) < (0.5 * NOISE[0] if early else 1.3 * expected)
 
 
-def speeds(delay, seconds, rng, motion):
+def speeds(delay, seconds, rng, motion, true=None):
     joint_times, times = np.arange(0.0, seconds, 0.01), np.arange(0.0, seconds, 0.02)
-    seen = measure(faulty(UR10E, Cell(), rng), motion(times), rng, *NOISE)
+    true = true or faulty(UR10E, Cell(), rng)
+    seen = measure(true, motion(times), rng, *NOISE)
     joints = motion(joint_times)
     return (
         *(UR10E, stamps(joint_times), joints, stamps(times + delay)),
@@ -214,6 +216,17 @@ def test_find_delay_looks_up_to_a_second_to_both_sides(rng, delay):
     found = find_delay(*speeds(delay, 30.0, rng, motion))
     assert found.seconds == pytest.approx(delay, abs=1e-4)
     assert found.correlation > 0.95
+
+
+@pytest.mark.parametrize('lost', [0.0, 0.05])
+def test_find_delay_by_positions_far_from_the_flange_or_lost_at_times(rng, lost):
+    """Where halves of the motion tell each other, speeds may differ; zeros are no motion."""
+    true, motion, _ = true_cell(3)
+    far = replace(true, tool=true.tool.moved({'y': 0.5, 'z': 0.3}))
+    *given, positions, _ = speeds(0.1, 30.0, rng, motion, far)
+    positions[rng.random(len(positions)) < lost] = 0.0
+    found = find_delay(*given, positions, None)
+    assert found.seconds == pytest.approx(0.1, abs=2e-2 if lost else 2e-3)
 
 
 def test_find_delay_names_none_where_none_shows(rng):
