@@ -28,6 +28,7 @@ from calib_ros.estimation.system import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray, norms
+from calib_ros.settings import Settings
 
 _Modes: TypeAlias = Callable[[Observations], FloatArray]
 """Return how K delays make up those of N samples and L joints (K, N, L)."""
@@ -71,6 +72,21 @@ def uneven(problem: Problem, result: Identification) -> tuple[str, Problem] | No
             joints[:, own] += each.velocity[:, own] * np.einsum('k,knl->nl', sizes, modes(each))
         sets.append(replace(each, joints=joints))
     return text, problem.with_sets(sets)
+
+
+def other_delay(problem: Problem, result: Identification) -> str:
+    """Return that a fitted delay is too far from the one at which the joint values were taken."""
+    for each in problem.sets:
+        found = result.chain.frame(each.base).delay
+        if each.velocity is None or each.delay is None or found is None:
+            continue
+        read = float(np.median(each.delay))
+        if abs(found - read) > 0.5 * Settings.max_gap:
+            return (
+                f'joint values were read for measurements {read:.3f} s late, but these are about '
+                f'{found:.3f} s late: set delay to {found:.3f}, and sample anew'
+            )
+    return ''
 
 
 def unsteady(problem: Problem, result: Identification) -> tuple[str, bool]:

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.decision.delays import uneven, unsteady
+from calib_ros.decision.delays import other_delay, uneven, unsteady
 from calib_ros.decision.lost_rows import computed_rows
 from calib_ros.decision.misfits import explained_share, loose_target
 from calib_ros.decision.printed_board import stretched
@@ -226,7 +226,9 @@ def _lag(problem: Problem, result: Identification) -> Identification:
     else:
         found = uneven(problem, result)
     text, harmful = unsteady(problem, result)
-    if found is not None:
+    if read := other_delay(problem, result):
+        text, harmful = read, bool(result.refusals)
+    elif found is not None:
         text, other = found
         harmful = other is not None and _imitated(other, result)
     if harmful:

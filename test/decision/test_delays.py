@@ -9,7 +9,7 @@ from fits import NOISE, SIGMAS, UR10E, arm
 
 from calib_ros import Problem, identify
 from calib_ros.apply.simulation import measure
-from calib_ros.decision.delays import uneven
+from calib_ros.decision.delays import other_delay, uneven
 
 
 def moving(count, delays=0.0, noise=NOISE, errors=1.0):
@@ -79,3 +79,15 @@ def test_noise_of_the_device_is_no_motion():
 def test_noise_is_no_delay_and_few_poses_tell_none(count):
     problem = Problem(UR10E, moving(count, noise=3.0 * np.array(NOISE)), **SIGMAS)
     assert uneven(problem, identify(problem)) is None
+
+
+@pytest.mark.parametrize('late', [0.02, 0.2])
+def test_joint_values_taken_for_another_delay_are_told(late):
+    problem = Problem(UR10E, replace(moving(100, late), delay=np.full(100, 0.5)), **SIGMAS)
+    found = other_delay(problem, identify(problem))
+    told = re.fullmatch(
+        'joint values were read for measurements 0.500 s late, .* about (.*) s late: set delay .*',
+        found,
+    )
+    assert bool(told) == (late > 0.1)
+    assert told is None or abs(abs(float(told[1]) - 0.5) - late) < 2e-3
