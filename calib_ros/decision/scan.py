@@ -129,8 +129,10 @@ class Scan:
         if bounded == 'huber' and gross == 1 and (odd := every[every > OUTLIER]).size:
             usual = float(np.median(odd))
             weights = [w * usual / np.maximum(d, usual) for w, d in zip(weights, far, strict=True)]
-        few = few.weighted([w * each for w, each in zip(weights, seen, strict=True)])
-        self._equations = np.array([float(samples.rows) for samples in few.sets])
+        weights = [w * each for w, each in zip(weights, seen, strict=True)]
+        few = few.weighted(weights)
+        counted = zip(few.sets, weights, strict=True)  # a sample without weight tells nothing
+        self._equations = np.array([each.rows * float(np.mean(w > 0.0)) for each, w in counted])
         self.rows = _rows_of(few, self.chain, self.names)
         self.sets = sets = [samples.observations for samples in few.sets]
         order = np.argsort(np.concatenate([each.stamps_ns for each in sets]), kind='stable')

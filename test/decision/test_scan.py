@@ -75,6 +75,19 @@ def test_a_gross_error_near_an_end_is_no_move_there(seed, row):
     assert find_step(fitting.fit(Problem(UR10E, seen, **SIGMAS))) is None
 
 
+@pytest.mark.parametrize('seed', [5, 12])
+def test_gross_errors_among_few_positions_leave_freedoms_of_the_others_only(seed):
+    """Counted, they would make a move clear that takes most of the freedoms left."""
+    rng = np.random.default_rng([seed, 15])
+    *_, seen = measured_arm(seed, 15, oriented=False)
+    rows = rng.choice(15, 3, replace=False)
+    seen.positions[rows] += rng.normal(scale=0.005, size=(3, 3))
+    fitted = fitting.fit(Problem(UR10E, seen, **SIGMAS))
+    assert find_step(fitted) is None
+    model = scan.Scan(fitted, loaded=False, gross=0)
+    assert model.budget(model.groups[0])[0] == 3 * (15 - 3)
+
+
 @pytest.mark.parametrize('count', [6, 30, 400])
 def test_the_coarse_search_is_a_tenth_of_the_shorter_side_apart(count):
     some = scan._some_places(count)
