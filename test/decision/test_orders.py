@@ -275,7 +275,7 @@ def test_errors_larger_than_those_of_faulty_arms_are_suspicious(what, largest, n
             converged=True,
             refusals=(),
             coupled=0.0,
-            validation=judged,
+            comparison=judged,
             fitted=SimpleNamespace(figures_of_all=(fitted, None)),
             parameters=(),
         )
