@@ -53,8 +53,8 @@ OLDEST_PYTHON ?= python3.12
 OLDEST := .venv-oldest
 # Without modules that draw for minutes what commands of others call, too.
 OLDEST_TESTS ?= test/apply test/cli test/files test/kinematics \
-	$(foreach module,chart placement planning stated_noise,--ignore=test/apply/test_$(module).py) \
-	test/identification/test_identification.py test/sampling/test_session.py \
+	$(foreach module,chart placement planning stated_noise verification, \
+	--ignore=test/apply/test_$(module).py) test/identification/test_identification.py \
 	test/ros/test_node.py test/report/test_report_files.py test/test_packaging.py
 
 oldest: $(OLDEST)/installed
