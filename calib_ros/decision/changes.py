@@ -216,8 +216,7 @@ def _explanation(
     gain, change, covariance, rank = information.explained(columns.of(names))
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     chance = min(1.0, len(columns.sets) * chance_of(gain, rank, freedom))
-    if times is None:
-        times = columns.evidence(information, names)[1]
+    times = columns.evidence(information, names)[1] if times is None else times
     return Explanation(owner, names, gain, chance, share, change, sigma, times)
 
 
