@@ -327,7 +327,7 @@ class ChangeColumns:
 
     def of(self, names: Sequence[Parameter]) -> FloatArray:
         """Return the columns (P, k) of k parameters."""
-        return np.array([self._columns[name] for name in names]).T
+        return np.array([self._columns[name] for name in names]).reshape(-1, self._count).T
 
     def root(self, times: Mapping[Parameter, float]) -> FloatArray:
         """Return a root (P, k) of the covariance of changes so many typical ones large."""

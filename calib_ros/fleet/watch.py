@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Did the arm change between nights, when, and which joint (docs/fleet.md)?
 
-Night k brings the arm's parameters x_k with covariance C_k, without base and tool, and how they
-follow waves of its wobbling axes, T_k. The usual drift is no change: a random walk that adds G in
-a year (`age.py`). The mean of the last m nights (LAGS) is compared with the arm that the earlier
-nights tell, the mean y years older (Kalman 1960), both weighted by information:
+Night k brings the arm's parameters x_k with covariance C_k, base, tool and warmth free, and how
+they follow waves of its wobbling axes, T_k. The usual drift is no change: a random walk that adds
+G in a year (`age.py`). The mean of the last m nights (LAGS) is compared with the arm that the
+earlier nights tell, the mean y years older (Kalman 1960), both weighted by information:
 
     d = x_after - x_before,   t = T_after - T_before,   u = S^-1 d,   W = S^-1
     S = s^2 (C_after + C_before + G y + w^2 t t^T)
@@ -38,13 +38,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import special
 
 from calib_ros.decision.changes import (
+    SCALES,
     ChangeColumns,
     Explanation,
     Information,
     reason_in_words,
     reasons_of,
 )
-from calib_ros.estimation.levels import CLEARLY, KNOWN, SEVERAL, TELLING, chance_of
+from calib_ros.estimation.levels import CLEARLY, KNOWN, LARGEST_SCALE, SEVERAL, TELLING, chance_of
 from calib_ros.files.rows import Row
 from calib_ros.identification.age import YEAR, drift_of
 from calib_ros.kinematics.parameter import Parameter
@@ -304,16 +305,20 @@ def _information(
     """Return the information (K, P, P) of nights about parameters, without their tilts.
 
     And that times values and tilts (K, P, 1 + T). Other arm parameters are nominal, base and tool
-    free.
+    free, and all lengths together: one night is warmer than another.
     """
-    information, pulls = [], []
+    information, pulls, grown = [], [], dict[tuple[Parameter, ...], FloatArray]()
     most = max(row.tilts.size // len(row.names) for row, _ in fitted)
     for row, arm in fitted:
+        if arm not in grown:
+            columns = ChangeColumns(row.corrected(), arm, scaled=True)
+            scales = [name for _, (name, *_) in columns.sets if name in SCALES]
+            grown[arm] = LARGEST_SCALE * columns.of(scales)
         own = [row.names.index(name) for name in arm]
         which = [arm.index(name) for name in names]
         tilts = row.tilts[own] if row.tilts.size else np.zeros((len(own), most))
         square = row.covariance[np.ix_(own, own)] - (row.tilt or 0.0) ** 2 * tilts @ tilts.T
-        whole = np.linalg.inv(square)
+        whole = np.linalg.inv(square + grown[arm] @ grown[arm].T)
         information.append(whole[np.ix_(which, which)])
         pulls.append((whole @ np.column_stack([row.offsets[own], tilts]))[which])
     return np.array(information), np.array(pulls)
