@@ -29,7 +29,7 @@ from calib_ros.decision.changes import ChangeColumns, Explanation, Information
 from calib_ros.errors import InputError
 from calib_ros.estimation.gain import inverse_root
 from calib_ros.estimation.identifiability import structurally_independent
-from calib_ros.estimation.levels import CONFIDENT, SEVERAL, chance_of
+from calib_ros.estimation.levels import CONFIDENT, SCALE, SEVERAL, chance_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.posterior import size_group
 from calib_ros.estimation.sizes import TYPICAL
@@ -76,14 +76,20 @@ class Difference(Shown):
             return f'unchanged within {rounded(1e3 * self.limit)} mm'
         rms, limit = 1e3 * self.rms, 1e3 * self.limit
         size = f'{rounded(rms)} mm RMS over the joint range (at most {rounded(limit)} mm)'
-        if self.beyond > changes.FALSE_ALARM:
+        known = bool(self.changed) and self.unexplained > changes.FALSE_ALARM
+        warmer = known and all(
+            reason.names[0] in changes.SCALES and abs(reason.change[0]) > SCALE  # less is usual
+            for reason, *_ in self.changed
+        )
+        if self.beyond > changes.FALSE_ALARM and not warmer:
             return (
-                f'different by {size}: not noise, but perhaps smooth device errors or what the '
-                'models lack; to find out, measure the same poses from the same place'
+                f'different by {size}: not noise, but perhaps warmth, smooth device errors or '
+                'what the models lack; to find out, measure the same poses from the same place'
             )
-        if self.changed and self.unexplained > changes.FALSE_ALARM:
+        if known:
             reasons = changes.changes_in_words(self.changed)
-            return f'{reasons}; nothing else: was it bumped? Predictions differ by {size}'
+            why = 'is the arm warmer, or the device another?' if warmer else 'was it bumped?'
+            return f'{reasons}; nothing else: {why} Predictions differ by {size}'
         return f'many parameters differ, by {size}: are both of one robot? Identify again'
 
     def _repr_html_(self) -> str:
@@ -133,7 +139,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         raise InputError('neither calibration fitted a parameter of the arm')
     square, lacking = _squares((first, second), names)
     freedom = min(first.freedom, second.freedom)
-    columns = ChangeColumns(chain, names)
+    columns = ChangeColumns(chain, names, scaled=True)
     every = left_over = _information(names, change, square)
     chance = _chance(every, freedom)
     beyond = _chance(_information(names, change, lacking), freedom)
@@ -141,6 +147,10 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     while len(changed) < SEVERAL and (reasons := changes.reasons_of(left_over, columns, freedom)):
         changed.append(reasons)
         left_over = every.marginalised(columns.covariance(changed))
+    for k, given in enumerate(changed if len(changed) > 1 else ()):  # the first took from others
+        others = columns.covariance(changed[:k] + changed[k + 1 :])
+        again = changes.reasons_of(every.marginalised(others), columns, freedom)
+        changed[k] = again or given
     changed = changes.likelier(every, columns, freedom, changed)
     left_over = every.marginalised(columns.covariance(changed))
     another = is_another(every, columns, changed, first.chain, first.before)

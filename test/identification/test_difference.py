@@ -153,6 +153,22 @@ def test_a_joint_that_was_bumped_is_named(nights):
     assert back.changed[0][0].change[0] == pytest.approx(-reason.change[0], abs=5e-5)
 
 
+@pytest.mark.parametrize('scale', [1.5e-4, -3e-4])
+def test_a_warmer_arm_is_told_and_hides_no_bump(nights, scale):
+    """The bump was told as one of the whole joint, its warmth as one of other joints."""
+    true, first = nights
+    lengths = [n for n in UR.parameter_names if Parameter(n).is_length and not UR.owns_frame(n)]
+    warm = true.with_offsets({name: scale * UR.value(name) for name in lengths})
+    found = difference(first, calibrated(warm, 1))
+    assert [reasons[0].owner for reasons in found.changed] == ['device']
+    assert found.changed[0][0].change == pytest.approx([scale], abs=4e-5)
+    assert 'nothing else: is the arm warmer, or the device another?' in found.in_words()
+    bumped = difference(first, calibrated(warm.with_offsets({'elbow_joint.theta': 5e-4}), 1))
+    told = [[e.names for e in reasons] for reasons in bumped.changed]
+    assert sorted(told) == [[('device.ratio',)], [('elbow_joint.theta',)]]
+    assert 'was it bumped?' in bumped.in_words()
+
+
 @pytest.mark.parametrize('fixed', [(), UR.parameter_names[12:]])
 def test_a_change_of_a_pure_number_has_a_unit_that_exists(fixed):
     """It was "m1". Alone it is no change of a joint, a frame or the load."""
