@@ -191,7 +191,7 @@ def _source(options: argparse.Namespace) -> str:
             options.csv, options.measured = options.measured, None
     source = 'table' if options.csv or options.detections else 'bag'
     if (options.measured is None) == (source == 'bag'):
-        raise InputError('give a bag, or a table or --detections FILE (or both of these)')
+        raise InputError('give one input: a bag, or a table and/or --detections FILE')
     checks.refuse_ignored(options, source)
     return source
 

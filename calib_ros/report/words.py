@@ -186,8 +186,8 @@ def still_holds(updated: Recalibration, found: Judgement) -> tuple[bool, str]:
         asked = 'does {} give way?' if creeps else 'was {} bumped?'
         return False, (
             f'the calibration in use no longer fits, {reasons}: '
-            f'{asked.format("the robot, the target or the device")} {text}; call ~/clear, measure '
-            '8 poses or more, and call ~/identify or run calib_ros identify --previous'
+            f'{asked.format("the robot, the target or the device")} {text}; call ~/clear and '
+            'measure again: 30 poses for ~/identify, 8 for calib_ros identify --previous'
         )
     if not updated.explained:
         return False, (
@@ -220,7 +220,10 @@ def verdict_in_words(found: Judgement) -> str:
         if found.noise and found.needed is None:
             if found.overstated:
                 return f'no verdict: {found.overstated}; {told}'
-            return f'the device has too much noise to tell whether the calibration holds: {told}'
+            return (
+                f'the device has too much noise to tell: {told}; use one as accurate as that of '
+                'the calibration'
+            )
         return f'too few poses to tell whether the calibration holds: {told}; measure more'
     turned = turned_in_words(now)
     near = '; this is told only near these poses' * bool(found.near)

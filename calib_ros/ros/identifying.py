@@ -90,7 +90,7 @@ ANSWER_LENGTH = LONGEST // 2
 """Characters of an answer: a few terminal lines; the rest is in a file and the log."""
 KEEP = '; to keep it call ~/save'
 NOT_FILED = '; not filed'
-ONE_BEFORE = 'the last ~/identify has given no calibration, this is the one before it: '
+ONE_BEFORE = 'the last ~/identify gave no calibration, so the one before: '
 TELLING_RULES = {Rule.MISTAKE, Rule.DROPPED}
 """Rules whose advice says nothing without the refusal."""
 
@@ -156,8 +156,10 @@ class Identifying:
                 self._failed(err, '')
                 raise
             why = inputs.failures
-            hint = next((each.status for each in session.last_hints), session.state)
-            told = InputError('; '.join((*why, str(err), *(() if why else (hint,)))))
+            hints = session.last_hints
+            hint = next((each.status for each in hints), session.state)
+            told_already = why or hints or session.account().foreign_names
+            told = InputError('; '.join((*why, str(err), *(() if told_already else (hint,)))))
             self._failed(told, '; '.join(('no poses to fit', *why)), '' if why else hint)
             raise told from err
         samples = tuple(session.usable)
@@ -270,7 +272,7 @@ class Identifying:
             said, advice, end = self._short
             end += f' ... full text: {path.name if path else "in the log"}'
             longest = (ANSWER_LENGTH - len(end)) * 3 // 4
-            advice = advice and f' ... {shortened(advice, longest)}'
+            advice = advice and f' ... {textwrap.shorten(advice, longest, placeholder="")}'
             room = ANSWER_LENGTH - len(advice + end)
             if success or advice:
                 said = textwrap.shorten(said, room, placeholder='' if advice else ' ...')

@@ -103,5 +103,4 @@ def frozen(samples: Sequence[Sample]) -> Hint | None:
         f'{len(repeated)} poses repeat a position: is the device frozen?',
         f'{len(repeated)} poses repeat a position to the last digit, such as {where} m (does the '
         'device see the target and send live data?): measure again (node: ~/clear first)',
-        explains=False,
     )

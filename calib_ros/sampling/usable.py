@@ -15,6 +15,7 @@ from calib_ros.sampling.slices import Part
 from calib_ros.values import LARGEST, ROUNDED
 
 NO_STAMP = Lost('zero stamp (fill header.stamp where it is published)')
+UNSEEN = 'NaN or infinite position (does the device see the target?)'
 NOT_UNIT = 'quaternion not of length 1 (normalise it where it is published)'
 
 
@@ -45,7 +46,7 @@ def usable(found: Part, joints: bool = False) -> tuple[Flags, Counter[str]]:
         refuse(far > LARGEST, 'distance beyond 1000 km')
     else:
         at = numbers[:, :3]
-        refuse(~np.isfinite(at).all(axis=1), 'NaN or infinite position')
+        refuse(~np.isfinite(at).all(axis=1), UNSEEN)
         refuse((np.abs(at) > LARGEST).any(axis=1), 'position beyond 1000 km')
     if width >= 7:
         with np.errstate(over='ignore'):  # refused anyway

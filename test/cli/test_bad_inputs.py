@@ -17,8 +17,8 @@ def bad_inputs():
     bag_of = ('identify', '--chain', 'ur5e')
     good = (*csv_of, 'good.csv')
     chain_of = ('identify', '--csv', 'good.csv', '--chain')
-    yield 'no input', bag_of, 'give a bag, or a table'
-    yield 'two inputs', (*good, 'bag'), 'give a bag, or a table'
+    yield 'no input', bag_of, 'give one input: a bag, or a table'
+    yield 'two inputs', (*good, 'bag'), 'give one input: a bag, or a table'
     yield 'no such table', (*csv_of, 'missing.csv'), 'missing.csv'
     yield 'a table almost of this name', (*csv_of, 'godo.csv'), 'did you mean "good.csv"'
     yield 'only the ending', (*csv_of, 'jugs.csv'), 'jugs.csv: No such file or directory\n'

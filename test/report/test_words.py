@@ -131,6 +131,7 @@ def test_a_bump_between_the_poses_checked_is_named_alone():
     _, told = still_holds(replace(update, step=step), found)
     assert 'no longer fits, the zero of elbow_joint moved by 1 mrad before line 7: was' in told
     assert 'wrist_1_joint' not in told
+    assert '30 poses for ~/identify, 8 for calib_ros' in told  # 8 are too few for the former
     _, told = still_holds(replace(update, step=replace(step, slow=True)), found)
     assert ': does the robot, the target or the device give way? RMS' in told
 

@@ -35,13 +35,13 @@ from calib_ros.shown import moment
 
 def test_errors_are_answers(cell, recording):
     for name, said in (
-        ('identify', 'no poses to fit'),
-        ('capture', 'no joint states received'),
+        ('identify', 'check joint_topics, sources, their types and QoS$'),
+        ('capture', 'no joint states of all joints received'),
         ('remove_last', 'no pose to remove'),
         ('validate', 'identify or load one first'),
         ('load', '~/save first, or set calibration_filename'),
     ):
-        assert said in cell.refused(name).message
+        assert said in f'{cell.refused(name).message}$'
     cell.play(part(recording, 0.0, 2.0))
     assert 'too few different poses: 2 measured, at least 5' in cell.refused('identify').message
 
@@ -63,6 +63,8 @@ def test_what_gave_no_pose_is_in_the_short_answer(cell, recording, prefix, said)
     answer = cell.refused('identify')
     assert len(answer.message) <= 200
     assert answer.message.startswith(f'no poses to fit ... {said}')
+    assert 'characters)' not in answer.message
+    assert not prefix or cell.in_full(answer).endswith('set joint_names (--joint-names)')
 
 
 def test_clocks_that_disagree_are_to_be_set_first(unsearched, cell, recording):
