@@ -133,12 +133,12 @@ def _brief(value: object) -> str:
         return f'{value:.6g}'
     if isinstance(value, tuple | list | Mapping):
         plain = not any(isinstance(each, np.ndarray | Shown) for each in value)
-        text = repr(value) if plain else ''
-        return text if 0 < len(text) <= 60 else f'<{len(value)} in a {type(value).__name__}>'
+        text, kind = repr(value) if plain else '', type(value).__name__
+        if 0 < len(text) <= 60:
+            return text
+        return f'<{kind}>' if hasattr(value, '_fields') else f'<{len(value)} in a {kind}>'
     text = repr(value)
-    if len(text) > 60 and is_dataclass(value) and 'array(' in text:
-        return f'<{type(value).__name__}>'
-    return clipped(text)
+    return f'<{type(value).__name__}>' if len(text) > 60 and is_dataclass(value) else clipped(text)
 
 
 def clipped(text: str) -> str:

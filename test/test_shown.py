@@ -57,6 +57,8 @@ def test_a_value_fits_on_a_screen(value):
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 99
     assert lines[0].startswith(type(value).__name__ + '(')
+    assert repr(value).count('(') == repr(value).count(')')  # no value is cut in its middle
+    assert 'in a Unmodelled' not in repr(value)  # a tuple with names
     assert len(re.findall('<tr>', value._repr_html_())) >= 5
 
 
