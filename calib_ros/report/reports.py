@@ -35,11 +35,11 @@ from calib_ros.shown import counted, rounded, sentence, some
 
 NOT_YET = 'The robot itself is unchanged so far'
 BRING = (
-    'give the correction to its controller (calib_ros export, or ~/export of the node), or '
-    'correct its programs (calib_ros compensate)'
+    'give the correction to the controller (calib_ros export, or ~/export of the node), or '
+    'correct the programs (calib_ros compensate)'
 )
 BRING_NEAR = (
-    'correct its programs (calib_ros compensate), which refuses other poses; in its controller '
+    'correct the programs with calib_ros compensate, which refuses other poses; in the controller '
     '(calib_ros export) the correction would act everywhere'
 )
 CLOSER = (
