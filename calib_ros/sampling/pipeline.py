@@ -71,8 +71,9 @@ class Pipeline:
     def unsettled(self) -> list[Hint]:
         """Return what looks wrong with measurements at stops, if no stamps explain it."""
         sampler, missed = self.collector.sampler, self.collector.unmeasured
-        found = of_two_places(sampler.doubled, 0.5 * sampler.rested)  # most of them, by turns
-        found += unsettled(sampler.restless, sampler.restless + sampler.rested)
+        stops = sampler.restless + sampler.rested
+        found = of_two_places(sampler.doubled, 0.5 * stops)  # most of them, by turns
+        found = found or unsettled(sampler.restless, stops)
         between = 0 if sampler.rested else self.collector.unused[Cause(POSES, MOVING)]
         return found + (unmeasured(missed, between) if sampler.rested or between else [])
 

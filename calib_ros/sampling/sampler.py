@@ -21,6 +21,7 @@ from calib_ros.sampling.means import averages, mean_of_each
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import POSES, Stamps, StreamKey
 from calib_ros.sampling.track import Motion
+from calib_ros.settings import Settings
 
 DISTANCE_SLICE, POSITION_SLICE = slice(0, 1), slice(0, 3)
 QUAT_SLICE, COVARIANCE_SLICE = slice(3, 7), slice(7, 43)
@@ -84,9 +85,12 @@ class Sampler:
         since = (stamps - np.repeat(stamps[begins], counts)).astype(np.float64)
         times = stamps[begins] + np.rint(mean_of_each(since, begins, means.used)).astype(np.int64)
         spikes = np.add.reduceat(~means.used, begins, dtype=np.intp)
-        each = (begins, counts, numbers[begins], times, spikes, means.rests)
+        each = (begins, counts, numbers[begins], times, spikes, means.rests, means.spreads)
         for k, row in enumerate(zip(*(part.tolist() for part in each), strict=True)):
-            begin, count, number, stamp_ns, left_out, rests = row
+            begin, count, number, stamp_ns, left_out, rests, spread = row
+            if rests and means.doubled[k]:
+                self.doubled.append(spread)
+                rests = spread <= Settings.largest_error  # else the mean is far from both
             if left_out or not rests:
                 self._shaken = min(self._shaken, number)
             if not rests:
@@ -94,7 +98,6 @@ class Sampler:
                 self.restless += 1
                 continue
             self.rested += 1
-            self.doubled += means.spreads[k : k + means.doubled[k]].tolist()
             rows = values[begin : begin + count]
             if left_out:
                 self.dropped[VIBRATING] += left_out
@@ -109,7 +112,7 @@ class Sampler:
                 velocity=None if motion.velocity is None else motion.velocity[k],
                 acceleration=None if motion.acceleration is None else motion.acceleration[k],
                 delay=delay,
-                spread=float(means.spreads[k]),
+                spread=spread,
             )
 
     def _of_images(self, found: Found) -> Iterator[Numbered]:

@@ -58,6 +58,14 @@ def test_the_rotation_of_a_spike_does_not_count(rng):
         np.testing.assert_allclose(sample.rotation, np.eye(3), atol=1e-12)
 
 
+def test_a_mean_between_two_places_is_no_pose(rng):
+    """That of two devices or targets by turns was one: the poses fitted, the frames were wrong."""
+    rotations = np.tile(np.eye(3), (20, 1, 1))
+    found, restless = samples(rotations, rng, range(1, 40, 2), stops=3)
+    assert [sample.count for sample in found] == [20]
+    assert restless == 1
+
+
 @pytest.mark.parametrize('kind', ['distance', 'eye_in_hand', 'images'])
 def test_only_a_target_seen_from_outside_is_a_place(kind):
     assert POSE.is_place
