@@ -17,7 +17,8 @@ from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.delay import LEAST_MOTION, SMOOTHING, STEP, Delay, find_delay
 from calib_ros.sampling.hints import Hint
 from calib_ros.sampling.sampler import POSITION_SLICE, QUAT_SLICE
-from calib_ros.sampling.slices import Piece, Series, StreamKey
+from calib_ros.sampling.slices import JointIndices, Piece, Series, StreamKey
+from calib_ros.sampling.track import Track
 from calib_ros.settings import Settings
 from calib_ros.shown import NAMED
 from calib_ros.values import MOST_NAMES
@@ -41,10 +42,11 @@ class Clocks:
     def __init__(self, chain: Chain, settings: Settings) -> None:
         self.settings = settings
         self._chain = chain
+        self._revolute = [joint.type == 'revolute' for joint in chain.joints]
         self._continuous = settings.mode == 'continuous'
         self._found: Delay | None = None  # in the motion that is sampled
         self._searched_ns = self._looked_ns = 0  # when it last did; 0 to begin with the next round
-        self._joints = Rows(len(chain.joints), settings.pose_buffer)
+        self._joints: dict[JointIndices, Rows] = {}
         self._poses: dict[StreamKey, Rows] = {}
         self._unrest = self._taken = self._agreed = 0
         self._awake = True
@@ -72,14 +74,14 @@ class Clocks:
         self._unrest, self._taken = unrest, taken
 
     def take(self, pieces: Sequence[Piece]) -> None:
-        """Watch values of all joints, and measured positions with the rotation if known."""
+        """Watch joint values, and measured positions with the rotation if known."""
+        capacity = self.settings.pose_buffer
         for key, _, stamps, numbers in pieces if self._awake else ():
-            rows = self._joints
-            if isinstance(key, StreamKey):
-                if not key.is_place or (key not in self._poses and len(self._poses) == MOST_NAMES):
-                    continue
-                rows = self._poses.setdefault(key, Rows(7, rows.capacity))
-            elif len(key) < rows.width:
+            if not isinstance(key, StreamKey):
+                rows = self._joints.setdefault(key, Rows(len(key), capacity))
+            elif key.is_place and (key in self._poses or len(self._poses) < MOST_NAMES):
+                rows = self._poses.setdefault(key, Rows(7, capacity))
+            else:
                 continue
             last = rows.stamps[-1:] if rows.count else np.array([-DENSE_NS])
             fresh = np.flatnonzero(np.diff(stamps // DENSE_NS, prepend=last // DENSE_NS))
@@ -94,22 +96,27 @@ class Clocks:
         """Evaluate the motion if it is due, and start again."""
         if not self.due(now_ns):
             return
-        if self._looked_ns and self._joints.count:
-            self._evaluate()
+        track = Track(self._revolute, self.settings.max_gap, self.settings.pose_buffer)
+        for columns, rows in self._joints.items():
+            track.extend(columns, rows.stamps, rows.values)
+        track.sort()
+        joints = track.samples()
+        if self._looked_ns and len(joints[0]):
+            self._evaluate(joints)
         self._looked_ns = now_ns
-        self._joints.keep(slice(0))
+        self._joints.clear()
         self._poses.clear()
 
-    def _evaluate(self) -> None:
-        joints, poses = self._joints, self._poses.values()
-        for rows in (joints, *poses):
+    def _evaluate(self, joints: Series) -> None:
+        poses = self._poses.values()
+        for rows in poses:
             rows.sort()
         measured = [(rows.stamps, rows.values) for rows in poses]
-        stand = bool(np.ptp(joints.values, axis=0).max() <= self.settings.still)
+        stand = bool(np.ptp(joints[1], axis=0).max() <= self.settings.still)
         deaf = stand and bool(poses) and all(map(self._moves_much, poses))
         self._deaf += deaf
         self._stuck = deaf or (stand and self._stuck)
-        found = self._delay_of((joints.stamps, joints.values), measured)
+        found = self._delay_of(joints, measured)
         if found is None:
             return
         known = self._seen

@@ -10,11 +10,13 @@ import pytest
 from fits import NOISE, UR10E, rms
 from hypothesis import given, strategies as st
 from scipy.signal import find_peaks
-from streams import START, S, hear, stamps, stops, sweep
+from streams import START, TRACKER, S, hear, stamps, stops, sweep
 
 from calib_ros import CalibrationSession, Settings
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.kinematics import se3
 from calib_ros.sampling.delay import LEAST_MOTION, find_delay, peaks
+from calib_ros.sampling.slices import Part
 
 SECONDS = 40.0
 
@@ -197,6 +199,26 @@ def test_stops_spoilt_by_a_delay_are_told(lag, settings, said):
     expected = NOISE[0] / np.sqrt(np.mean([each.count for each in session.samples]))
     early = lag < settings.get('delay', 0.0)  # the first of the motion is no spike yet
     assert np.sqrt((errors**2).mean()) < (0.5 * NOISE[0] if early else 1.3 * expected)
+
+
+def test_joints_published_in_parts_show_a_delay():
+    """They were not watched: the advice was to set settle."""
+    true, _, rng = true_cell(0)
+    times, session = np.arange(0.0, 24.0, 0.02), CalibrationSession(UR10E)
+    joints = stops(UR10E.random_joints(25, rng) * 0.5, 0.5, 0.5)(times)
+    seen = measure(true, joints, rng, *NOISE)
+    poses = np.hstack([seen.positions, se3.to_quat(seen.rotations)])
+    names, places = session.joint_names, 3 * np.arange(len(times))
+    session.take(
+        [
+            Part(places, None, ('', *names[:2]), stamps(times), joints[:, :2]),
+            Part(places + 1, None, ('', *names[2:]), stamps(times), joints[:, 2:]),
+            Part(places + 2, TRACKER, ('tracker',), stamps(times - 0.3), poses),
+        ]
+    )
+    session.finish()
+    assert f'stamps disagree: set delay to {session.delay.seconds:.3f}' in session.status()
+    assert session.delay.seconds == pytest.approx(-0.3, abs=1e-3)
 
 
 def speeds(delay, seconds, rng, motion, true=None):
