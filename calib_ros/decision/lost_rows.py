@@ -15,7 +15,13 @@ from itertools import product
 import numpy as np
 
 from calib_ros.decision.suspects import rows_away
-from calib_ros.decision.trials import fault_limit, in_frames, sample_errors
+from calib_ros.decision.trials import (
+    fault_limit,
+    in_frames,
+    refine_trial,
+    sample_errors,
+    trials_of,
+)
 from calib_ros.decision.undoing import Suspect
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import LEAST_ASIDE, NEARER
@@ -54,12 +60,16 @@ def row_loss(
         s: replace(seen.select(own), joints=seen.joints[rows[own] + s])
         for s, own in inside.items()
     }
-    for part, shift in product((rows < count // 3, rows >= count - count // 3), SLIPS):
-        some = paired[shift].select(part[inside[shift]])
-        found = in_frames(problem, nominal, (some,))
+    arms = {s: flange(nominal, pairs) for s, pairs in paired.items()}
+    thirds = product((rows < count // 3, rows >= count - count // 3), SLIPS)
+    some = [paired[shift].select(part[inside[shift]]).spread() for part, shift in thirds]
+    for trial in trials_of((nominal, (each,)) for each in some):
+        if trial.sets[0].oriented.any() and trial.error > max(largest, NEARER * trial.spread):
+            continue  # of another shift; of positions alone a right one may leave as much
+        chain = refine_trial(problem, trial).chain
         tables = {s: np.full(count, np.inf) for s in SLIPS}
         for s, pairs in paired.items():
-            tables[s][inside[s]] = sample_errors(found.chain, pairs, flange(found.chain, pairs))
+            tables[s][inside[s]] = sample_errors(chain, pairs, arms[s])
         for before, after in product(SLIPS, SLIPS):
             if before and after:
                 continue
