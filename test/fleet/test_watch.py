@@ -65,7 +65,7 @@ def test_a_bump_is_found_within_two_nights_and_its_joint_named(first, rng, name)
 
 def test_a_large_bump_of_one_joint_is_none_of_two(first, rng):
     """The rest may just seem to scatter more beside one than beside two."""
-    for name in 10 * BUMPS:
+    for name in 3 * BUMPS:
         rows = list(nights(first, rng, 6, (4, name)))
         bump = 9.0 * SIZES[Parameter(name).unit] * (np.array(first.names) == name)
         rows[4:] = (replace(row, offsets=row.offsets + bump) for row in rows[4:])
@@ -114,8 +114,8 @@ def test_an_unchanged_arm_raises_no_alarm(first, rng):
 
 @pytest.mark.parametrize('scatter', [1.5, 2.0])
 def test_first_nights_that_scatter_more_are_no_alarm(first, rng, scatter):
-    """How much nights scatter is not known yet: of 100 robots one has an alarm in 100 years."""
-    found = [watch(list(nights(first, rng, 6, scatter=scatter)), 100.0) for _ in range(50)]
+    """How much nights scatter is not known yet: of 40 robots one has an alarm in 100 years."""
+    found = [watch(list(nights(first, rng, 6, scatter=scatter)), 100.0) for _ in range(20)]
     assert not any(each.changes for each in found)
 
 
