@@ -13,6 +13,7 @@ from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.changes import reason_in_words
 from calib_ros.decision.mistakes import diagnose
 from calib_ros.errors import InputError
+from calib_ros.identification import recalibration
 from calib_ros.identification.recalibrated import ANEW
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.parameter import Parameter
@@ -25,6 +26,12 @@ def earlier(request):
     """Return an arm, its calibration from poses or positions, and which of these."""
     true = faulty(UR10E, Cell(), np.random.default_rng(4))
     return true, Calibration.of(identify(problem(true, 60, 0, request.param))), request.param
+
+
+@pytest.fixture
+def none_odd(monkeypatch):
+    """Let no single pose be left out, which takes longer than all else."""
+    monkeypatch.setattr(recalibration, '_without_one', lambda *_: ())
 
 
 def slipped(true, zeros):
@@ -159,7 +166,7 @@ def test_a_frame_that_was_hit_is_not_blamed_on_a_link(earlier, frame, seed):
     assert any(frame in each for each in owners(found.changed))
 
 
-def test_another_load_is_no_change_of_the_arm(earlier):
+def test_another_load_is_no_change_of_the_arm(earlier, none_odd):
     """Zeros imitated its bending near some poses, and made the arm worse elsewhere."""
     true, previous, oriented = earlier
     last = UR10E.joint_names[-1]
@@ -250,7 +257,7 @@ def test_another_target_of_a_scara_leaves_its_device_where_it_stands(seed, orien
     assert rms(found.calibration.chain, now, q) < 2.0 * rms(previous.chain, true, q)
 
 
-def test_a_device_and_a_target_far_away_ask_for_their_new_frames(earlier):
+def test_a_device_and_a_target_far_away_ask_for_their_new_frames(earlier, none_odd):
     """The remedy was to identify again."""
     true, previous, oriented = earlier
     rng = np.random.default_rng(1)
