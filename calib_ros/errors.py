@@ -95,7 +95,7 @@ class TooFewObservationsError(InputError):
         return TooFewObservationsError(self.configurations, self.needed, self.why, account)
 
 
-def near(name: str, alternatives: Iterable[str], least: float = 0.5) -> str:
+def near(name: str, alternatives: Iterable[str], least: float = 0.51) -> str:
     """Return 'did you mean "...?"' with the most similar alternative, if any."""
     import difflib  # slow to load
 

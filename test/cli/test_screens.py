@@ -215,8 +215,8 @@ def served(cell, monkeypatch, request):
 
 def test_a_wrong_command_proposes_the_right_one(shown):
     status, text = shown('identfy')
-    assert status == 2
-    assert 'unknown command "identfy": did you mean "identify"?' in text
+    assert (status, 'command "identfy": did you mean "identify"?' in text) == (2, True)
+    assert 'did you mean' not in shown('calibrate')[1]  # not "compare"
 
 
 def test_every_command_has_a_screen():
