@@ -84,7 +84,19 @@ def _fit_refusals(
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
         far = some([f'{p.name} by {_far(p, problem.largest_angle)}' for p in beyond])
         text = f'off by more than even a faulty robot of this kind: {", ".join(far)}'
-        yield Reason(Rule.COMMON_SENSE, text)
+        yield Reason(Rule.COMMON_SENSE, _other_unit(result) * (len(beyond) > 1) + text)
+
+
+def _other_unit(result: Identification) -> str:
+    """Return that all lengths are the same multiple of the nominal ones; empty if not."""
+    rows = [p for p in result.parameters if p.name.of_dh and p.name.is_length and p.std]
+    offset = np.array([p.offset for p in rows])
+    nominal = np.array([p.value for p in rows]) - offset
+    change = offset @ nominal / (nominal @ nominal or 1.0)
+    if np.linalg.norm(offset - change * nominal) > EXCEPTION * np.linalg.norm(offset):
+        return ''
+    times = f'all lengths come out {1.0 + change:.3g} times as long as nominal'
+    return f'{times}, as if positions were in another unit (table: --length); '
 
 
 def _far(parameter: ParameterRow, largest: float) -> str:

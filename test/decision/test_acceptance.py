@@ -227,6 +227,14 @@ def test_rows_in_another_order_do_not_look_like_the_wrong_arm():
     assert Rule.COMMON_SENSE not in rules
 
 
+def test_lengths_that_are_one_multiple_ask_for_the_unit():
+    """Positions in mm, read as inches: the arm was said to be another one."""
+    *_, seen = measured_arm(3, 60)
+    result = identify(Problem(UR10E, replace(seen, positions=25.4 * seen.positions)))
+    (far,) = [str(each) for each in result.refusals if each.rule is Rule.COMMON_SENSE]
+    assert far.startswith('all lengths come out 25.4 times as long as nominal, as if positions')
+
+
 @pytest.mark.parametrize('kind', ['base', 'tool'])
 def test_an_arm_does_not_make_up_for_a_frame_held_a_little_off(kind):
     """An arm without errors, moved joint by joint; the message says what to do, of it alone."""
