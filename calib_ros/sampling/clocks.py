@@ -165,6 +165,9 @@ class Clocks:
         """
         found = []
         for stamps, rows in streams:
+            places = rows[:, POSITION_SLICE]
+            fresh = 1 + np.flatnonzero((places[1:] != places[:-1]).any(axis=1))
+            stamps, rows = stamps[fresh], rows[fresh]  # others are held, without a target
             oriented = len(rows) > 0 and not np.isnan(rows[:, QUAT_SLICE]).any()
             turns = se3.from_quat(rows[:, QUAT_SLICE]) if oriented else None
             positions, max_gap = rows[:, POSITION_SLICE], self.settings.max_gap

@@ -232,6 +232,20 @@ def speeds(delay, seconds, rng, motion, true=None):
     )
 
 
+@pytest.mark.parametrize('oriented', [True, False])
+def test_a_device_that_holds_its_last_pose_without_a_target_hides_no_delay(oriented):
+    true, motion, rng = true_cell(0)
+    joint_times, times = np.arange(0.0, 30.0, 0.01), np.arange(0.05, 29.7, 0.02)
+    index = np.arange(len(times))
+    held = np.where(index % 100 < 15, index - index % 100, index)  # 0.3 s of every 2 s
+    seen = measure(true, motion(times), rng, *NOISE).select(held)
+    session = CalibrationSession(UR10E, Settings(mode='continuous'))
+    turns = seen.rotations if oriented else None
+    told(session, joint_times, motion(joint_times), times, seen.positions, turns, 0.2)
+    session.finish()
+    assert session.delay.seconds == pytest.approx(0.2, abs=5e-3)
+
+
 @pytest.mark.parametrize('delay', [0.0, 0.9024, -0.9024])
 def test_find_delay_looks_up_to_a_second_to_both_sides(rng, delay):
     _, motion, _ = true_cell(3)
