@@ -349,9 +349,9 @@ def true_arm():
     return faulty(load_chain('ur10e'), SimulatedCell(), np.random.default_rng(1))
 
 
-def shift(truth):
+def shift(truth, joint_rate=50.0):
     """Return a recording: the arm moves to 24 configurations and is measured at each."""
-    cell = SimulatedCell(joint_rate=50.0, move=0.4, dwell=0.6, poses_per_dwell=4)
+    cell = SimulatedCell(joint_rate=joint_rate, move=0.4, dwell=0.6, poses_per_dwell=4)
     rng = np.random.default_rng(2)
     configurations = truth.random_joints(STOPS, rng)
     stamps, joints, pose_stamps = drive(configurations, cell, START)

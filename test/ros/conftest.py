@@ -23,11 +23,12 @@ def truth():
     return true_arm()
 
 
-@pytest.fixture(scope='session')
-def recording(truth):
+@pytest.fixture(scope='module')
+def recording(request, truth):
+    """Return a shift, with as many joint states as a module asks for: 50 a second or fewer."""
     from ros_cell import shift
 
-    return shift(truth)
+    return shift(truth, getattr(request.module, 'JOINT_RATE', 50.0))
 
 
 @pytest.fixture

@@ -37,6 +37,8 @@ from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.topics import outputs
 from calib_ros.settings import Settings
 
+JOINT_RATE = 25.0  # they cost more than what is asked
+
 
 @pytest.fixture(scope='module')
 def motion(truth, recording):

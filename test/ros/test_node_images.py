@@ -60,7 +60,7 @@ def shift(truth):
     rng = np.random.default_rng(5)
     seen = photograph(truth, VIEW, CHARUCO.corners, True, STOPS, rng)
     configurations = seen.joints[:: len(CHARUCO.corners)]
-    cell = SimulatedCell(joint_rate=50.0, move=0.4, dwell=0.6, poses_per_dwell=EACH)
+    cell = SimulatedCell(joint_rate=25.0, move=0.4, dwell=0.6, poses_per_dwell=EACH)
     stamps, joints, image_stamps = drive(configurations, cell, START)
     poses = se3.invert(truth.forward(configurations))
     shots = []
