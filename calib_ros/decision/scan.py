@@ -24,7 +24,7 @@ from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import SOME
 from calib_ros.estimation.gain import inverse_root
 from calib_ros.estimation.gross_errors import SUSPICIOUS
-from calib_ros.estimation.levels import LEAST_ASIDE
+from calib_ros.estimation.levels import LEAST_ASIDE, NEARER
 from calib_ros.estimation.pixels import in_view
 from calib_ros.estimation.samples import gram
 from calib_ros.estimation.system import System
@@ -123,6 +123,7 @@ class Scan:
         self.weights = [weights_of(each, robust.loss) for each in far]
         bounded = 'huber' if gross and robust.loss != 'none' else robust.loss
         few = robust.system.select(self.chosen)
+        self._even = few.weighted([None] * len(few.sets))
         seen = [in_view(self.chain, each.observations) for each in few.sets]
         weights = [weights_of(each, bounded) for each in far]
         every = np.concatenate(far)
@@ -197,6 +198,16 @@ class Scan:
         gross = np.setdiff1d(numbers, numbers[weights > 0.0])
         alone = len(gross) >= LEAST_ASIDE and np.ptp(gross) < len(gross)
         return (int(gross[0]), int(gross[-1]) + 1) if alone else ()
+
+    def tears(self, group: Moving, size: FloatArray) -> bool:
+        """Tell whether a move of that size (K,) is as large as the gross errors `torn` off."""
+        first, last = self.torn or (0, 0)
+        torn = self._even.select([np.flatnonzero((first <= n) & (n < last)) for n in self.numbers])
+        columns, squares = [self.names.index(name) for name in group.names], np.zeros(2)
+        for rows in _rows_of(torn, self.chain, self.names):
+            moved = np.tensordot(size, rows[columns], 1)
+            squares += np.sum(moved**2), np.sum(rows[-1] ** 2)
+        return bool(squares[0] > NEARER**2 * squares[1])
 
     def moving(self, group: Moving, switched: Switched) -> tuple[FloatArray, FloatArray]:
         """Return products (B, K, P + 1) of a group's moves with the fit, and (B, K, K)."""

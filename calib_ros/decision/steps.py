@@ -74,10 +74,10 @@ def find_step(fitted: Fitted) -> Step | None:
             found = replace(found, sizes=(2.0 * half,), slow=True, spoils=spoils)
         return _described(scan, found, quiet)
     found = _imitated(scan, fitted)
-    torn = found is not None and found.group.kind in IN_THE_CELL and scan.torn
-    if found is not None and not torn and fitted.robust.outliers.any():
-        scan = Scan(fitted, loaded=bends, gross=0)  # these gross errors are no move
-        found = _imitated(scan, fitted)
+    if found is not None and fitted.robust.outliers.any():
+        torn = found.group.kind in IN_THE_CELL and scan.tears(found.group, found.sizes[0])
+        scan = scan if torn else Scan(fitted, loaded=bends, gross=0)  # others are no move
+        found = found if torn else _imitated(scan, fitted)
     step = None if found is None else _described(scan, found, quiet)
     return step if step is not None and step.harmful else None  # else nothing was imitated
 
@@ -278,7 +278,7 @@ def _imitated(scan: Scan, fitted: Fitted) -> _Found | None:
         gains = arm.gains(rows, own)
         k = int(np.argmax(gains))
         odds, size = arm.move_odds(rows[k], own[k])
-        if np.isfinite(odds) and first + k in scan.torn:
+        if np.isfinite(odds) and first + k in scan.torn and scan.tears(group, size):
             odds = float(gains[k])
         if odds - trials > highest:
             highest = odds - trials + HALF_THE_DIGITS * abs(odds)
