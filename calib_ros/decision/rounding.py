@@ -157,10 +157,11 @@ def may_be_rounding(fitted: Fitted, before: Chain, coarse: Mapping[str, float]) 
     followed, shown = np.zeros((len(names), len(names))), 0.0
     values = np.concatenate([each.joints for each in sets]).T
     for joint, q in zip(chain.joints, values, strict=True):
-        different, level = np.unique(q, return_inverse=True)
-        if joint.name in coarse and 2 * len(different) <= len(q):
-            column = rows[:, [wanted.index(joint.driven)]] * coarse[joint.name] / np.sqrt(12.0)
-            along = np.zeros((len(different), len(names)))
+        _, level, count = np.unique(q, return_inverse=True, return_counts=True)
+        if joint.name in coarse:
+            step = coarse[joint.name] * (count > 1)[level[owner], np.newaxis]
+            column = rows[:, [wanted.index(joint.driven)]] * step / np.sqrt(12.0)
+            along = np.zeros((len(count), len(names)))
             np.add.at(along, level[owner], own * column)
             followed += along.T @ along
             shown += float(np.sum(column**2) - np.sum(along @ inverse * along))

@@ -229,13 +229,17 @@ def test_an_arm_is_not_bent_to_rounding_that_poses_share(seed, errors):
         assert told == (moved is q or not errors)
 
 
-@pytest.mark.parametrize('seed', [0, 1])
-def test_how_far_rounding_moves_an_arm(seed, monkeypatch):
-    """By offsets drawn for each value and fitted by plain least squares."""
+@pytest.mark.parametrize(('seed', 'shared'), [(0, 40), (1, 40), (1, 16)])
+def test_how_far_rounding_moves_an_arm(seed, shared, monkeypatch):
+    """By offsets drawn for each value and fitted by plain least squares.
+
+    Values that poses share did not count if those of more than half were different: with 10 mrad
+    in clusters one of 60 was accepted, 1.2 mm off instead of 0.15.
+    """
     rng = np.random.default_rng(seed)
     level = rng.integers(4, size=40)
     q = UR10E.random_joints(40, rng)
-    q[:, 2] = 0.3 * level
+    q[:shared, 2], level[shared:] = 0.3 * level[:shared], -1
     seen = measure(arm(rng), q, rng, *NOISE)
     fitted = fit(Problem(UR10E, seen, **SIGMAS))
     before = replace(UR10E, base=fitted.chain.base, tool=fitted.chain.tool)
