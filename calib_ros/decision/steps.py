@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -171,7 +170,7 @@ def _several(scan: Scan, alone: _Found | None) -> _Found | None:
     found = min(filter(None, every), key=lambda each: each.criterion, default=None)
     if found is None or (alone is not None and alone.criterion <= found.criterion):
         return alone
-    return alone if _drifts(scan, found) or _apart(scan, found) else found
+    return alone if _drifts(scan, found) else found
 
 
 def _several_of(scan: Scan, group: Moving) -> _Found | None:
@@ -304,20 +303,6 @@ def _drifts(scan: Scan, found: _Found) -> bool:
     gain, rank, _ = gain_of(matrix, scan.fitted)
     total, free = scan.all
     return free > rank and (total - gain) / (free - rank) < found.variance
-
-
-def _apart(scan: Scan, found: _Found) -> bool:
-    """Tell whether poses between steps lie apart, or a joint: errors of the arm may look so."""
-    sets = found.group.sets
-    numbers, joints = np.concatenate([scan.numbers[k] for k in sets]), scan.joints(sets)
-    ends = np.searchsorted(found.stops, numbers, side='right')
-    parts = (joints[ends == k] for k in range(len(found.stops) + 1))
-    for one, other in pairwise(parts):
-        after = np.arange(len(one) + len(other)) >= len(one)
-        beside = (one.max(axis=0) < other.min(axis=0)) | (other.max(axis=0) < one.min(axis=0))
-        if beside.any() or _separable(np.concatenate([one, other]), after):
-            return True
-    return False
 
 
 def _described(scan: Scan, found: _Found, quiet: bool) -> Step | None:
