@@ -75,7 +75,7 @@ class Inference:
         shift, covariance = columns.averaged(wider, near)
         precision, count = wider.precision(size), columns.arm.stop
         device = _device(sums.plain[:-1, :-1], sums.cross[:-1], sums.doubtful, precision, count)
-        found = replace(found, shift=shift, covariance=covariance, device=device)
+        found = replace(found, shift=shift, covariance=self._shared(covariance), device=device)
         return found if self.fitted.held is None else found.held_at(*self.fitted.held)
 
     def with_mixture(self, posterior: Posterior) -> Posterior:
@@ -99,15 +99,18 @@ class Inference:
             odds, mean, covariance = max(against, key=lambda each: each[0])
             # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
             odds += float(special.logit(1.0 - CONFIDENT if checked else UNUSUAL))
-            rival, device = (odds, mean[arm], covariance[arm, arm]), mean[arm.stop :]
+            rival = odds, mean[arm], self._shared(covariance[arm, arm])
+            device = mean[arm.stop :]
         found = [(w, *solved(*columns.normal, wider.precision(each))) for w, each in near]
         if self.strained:
             own, weights = np.s_[: len(posterior.names)], [weight for weight, _ in near]
             mean, covariance = mixed([(mean[own], root[own]) for _, mean, root in found], weights)
             posterior = replace(
-                posterior, shift=mean - columns.offsets[own], covariance=covariance
+                posterior, shift=mean - columns.offsets[own], covariance=self._shared(covariance)
             )
-        mixture = [(w, mean[arm], root[arm] @ root[arm].T) for w, mean, root in found]
+        mixture = [
+            (w, mean[arm], self._shared(root[arm] @ root[arm].T)) for w, mean, root in found
+        ]
         if fitted.held is not None:  # nothing measures the scale
             mixture = [posterior.with_held(each, *fitted.held) for each in mixture]
         elif columns.scaled and rival is None:
@@ -115,6 +118,11 @@ class Inference:
         scale, strain = float(device[-1]), differing(device[:-1])
         likely = tuple(mixture)
         return replace(posterior, mixture=likely, rival=rival, scale=scale, strain=strain)
+
+    def _shared(self, covariance: FloatArray) -> FloatArray:
+        """Return a covariance with what errors shared by neighbours add."""
+        more = self.fitted.uncertainty.shared
+        return covariance + np.pad(more, (0, len(covariance) - len(more)))
 
 
 class _Columns:

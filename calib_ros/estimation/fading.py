@@ -15,6 +15,9 @@ from calib_ros.estimation.system import System
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray, Index
 
+DECAYS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
+"""Decay lengths of shared errors: stops, and rad (m) of all joints together."""
+
 
 def faded_near(
     units: Stops, part: int, kernels: Sequence[tuple[float, float]], stride: int

@@ -117,11 +117,15 @@ def noise_of(
     parts = [uncertainty.covariance(factor, middle) for middle in sources]
     by_priors = plain @ extra.T
     covariance = np.array([*parts, by_priors @ by_priors.T])
+    found = Uncertainty(covariance, freedom)
     if neighbours.middles:
         alone = np.sum(plain @ sum(middles, extra.T @ extra) * plain, axis=1)
         widened = float(np.median(np.sqrt(np.diag(covariance.sum(axis=0)) / alone)))
         noise = replace(noise, widened=widened)
+        if neighbours.drifting:
+            beyond = sum(sources) - widened**2 * sum(middles)
+            found = replace(found, shared=uncertainty.covariance(factor, beyond))
     if estimated.any():
         size = np.sqrt(np.median(np.diag(covariance.sum(axis=0)) / np.diag(plain)))
         noise = replace(noise, size=float(size))
-    return noise, Uncertainty(covariance, freedom)
+    return noise, found

@@ -15,7 +15,7 @@ from calib_ros.estimation.samples import gram
 from calib_ros.estimation.stops import Stops
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 
-_Part: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+PartRows: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """Orthonormal columns (n, c, P), residuals and which are known (n, c), and products (P, P)."""
 
 
@@ -42,7 +42,7 @@ class QuadraticForms:
         basis = np.delete(stacked[:, :-1], untold, axis=1)
         basis = linalg.qr(basis, mode='economic', overwrite_a=True, check_finite=False)[0]
         left = stacked[:, -1] - basis @ (basis.T @ stacked[:, -1])
-        self.parts: dict[int, _Part] = {}
+        self.parts: dict[int, PartRows] = {}
         first = 0
         for part, each in enumerate(units.parts):
             shape = each.shape[1:]

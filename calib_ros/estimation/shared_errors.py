@@ -18,6 +18,8 @@ neighbours, the noise is modelled as a sum of independent and fading parts,
 where the sizes v_k >= 0 equate the forms r^T K_k r with their expected values (MINQUE, Rao 1971),
 which allows for errors absorbed by the fit. The covariance of the parameters is then
 H^-1 (J^T V J) H^-1.
+
+If the device drifts (`drifting.py`), the sizes are those of its errors.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from calib_ros.estimation.fading import faded_in_succession, faded_near
+from calib_ros.estimation.drifting import DRIFT_KERNELS, device_drift
+from calib_ros.estimation.fading import DECAYS, faded_in_succession, faded_near
 from calib_ros.estimation.leastsquares import Fit
 from calib_ros.estimation.levels import CERTAIN, TELLING
 from calib_ros.estimation.observations import numbered
@@ -39,9 +42,6 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 
-DECAYS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
-"""Decay lengths of shared errors: stops, and rad (m) of all joints together."""
-
 
 @dataclass(frozen=True, eq=False)
 class Shared:
@@ -49,13 +49,14 @@ class Shared:
 
     `successive` and `near` are the larger correlation of residuals of both parts, `found` the
     kinds of neighbours with shared errors by the test, `middles` J^T V J (P, P) of each part (0
-    position, 1 orientation) with shared errors.
+    position, 1 orientation) with shared errors; `drifting` the parts whose are the device's.
     """
 
     successive: float
     near: float
     found: tuple[str, ...]
     middles: dict[int, FloatArray]
+    drifting: tuple[int, ...]
 
 
 def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
@@ -64,11 +65,13 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     few, stride = gathered(fit.chain, names, system, MOST_STOPS)
     correlations = dict.fromkeys(kinds, 0.0)
     if len(few) < TELLING:
-        return Shared(**correlations, found=(), middles={})
+        return Shared(**correlations, found=(), middles={}, drifting=())
     extra, _ = system.extra_rows(fit.chain, names)
     forms = QuadraticForms(few, extra, _alike(fit.chain, names, extra))
     limit = special.ndtri(1.0 - (1.0 - CERTAIN) / (len(kinds) * len(forms.parts)))
     alike: dict[int, list[str]] = {}
+    drifts: dict[int, FloatArray] = {}
+    placed = any(samples.observations.socket for samples in system.sets)  # without a device
     for kind in kinds:
         links = few.links(kind)
         for part in forms.parts:
@@ -76,13 +79,18 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
             correlations[kind] = max(correlations[kind], correlation)
             if score > limit:
                 alike.setdefault(part, []).append(kind)
+            if kind == 'successive' and score > 1.0 and not placed:  # by chance one of six
+                drift = device_drift(forms.parts[part], few)
+                drifts |= {} if drift is None else {part: drift}
+    alike |= {part: ['successive'] for part in drifts}
     if not alike:
-        return Shared(**correlations, found=(), middles={})
+        return Shared(**correlations, found=(), middles={}, drifting=())
     kernels = {
         part: [(kind, length) for kind in kinds if kind in found for length in DECAYS[kind]]
         for part, found in alike.items()
     }
-    sizes = forms.sizes(kernels)
+    kernels |= dict.fromkeys(drifts, DRIFT_KERNELS)
+    sizes = forms.sizes(kernels) | drifts
     alike = {part: found for part, found in alike.items() if sizes[part].any()}
     even = few if stride == 1 else gather(fit.chain, names, system, stride, 1)
     middles: dict[int, FloatArray] = {}
@@ -99,7 +107,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     for part, middle in successive.items():
         middles[part] += middle
     found = tuple(kind for kind in kinds if any(kind in each for each in alike.values()))
-    return Shared(**correlations, found=found, middles=middles)
+    return Shared(**correlations, found=found, middles=middles, drifting=tuple(drifts))
 
 
 def _alike(chain: Chain, names: Sequence[str], extra: FloatArray) -> list[list[int]]:

@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import lapack
@@ -33,7 +34,7 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
     root[:, rank:] = 0.0  # no rounding below zero
     if np.isclose((root**2).sum(), np.trace(turned), rtol=HALF_THE_DIGITS, atol=0.0):
         root = inverse[:, order - 1] @ root
-    else:  # thinned pairs of neighbours estimate a middle that is not positive
+    else:  # not positive: of thinned pairs of neighbours, or a difference
         sizes, axes = np.linalg.eigh(turned)
         root = inverse @ (axes * np.sqrt(np.maximum(sizes, 0.0)))
     return np.asarray(root @ root.T)
@@ -45,11 +46,13 @@ class Uncertainty(Shown):
 
     `parts` (K, P, P) belong to position, orientation and priors, or to all of these, to parameters
     held at nominal, and to what no parameter explains; `freedom` (K,) are the degrees of freedom
-    of each, infinite if the noise is known.
+    of each, infinite if the noise is known. `shared` (F, F) is what errors shared by neighbours
+    add to the covariance by independent noise of one size, of F parameters if there are any.
     """
 
     parts: FloatArray
     freedom: FloatArray
+    shared: FloatArray = field(default_factory=partial(np.zeros, (0, 0)))
 
     @property
     def covariance(self) -> FloatArray:
@@ -59,7 +62,7 @@ class Uncertainty(Shown):
     def with_part(self, part: FloatArray) -> Uncertainty:
         """Return the uncertainty with a further source (P, P) of known size."""
         parts = np.concatenate([self.parts, part[np.newaxis]])
-        return Uncertainty(parts, np.append(self.freedom, np.inf))
+        return replace(self, parts=parts, freedom=np.append(self.freedom, np.inf))
 
     @property
     def overall(self) -> float:

@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.estimation import quadratic_forms, samples as samples_module, shared_errors
-from calib_ros.estimation.fading import faded_in_succession, faded_near
+from calib_ros.estimation.fading import DECAYS, faded_in_succession, faded_near
 from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.stops import ELSEWHERE, Stops, gather
@@ -167,7 +167,7 @@ def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
 def test_where_no_more_was_measured_than_fitted_nothing_is_shared():
     """One residual is all that 20 images of 2 means each leave of 39 parameters."""
     rng = np.random.default_rng(0)
-    count, kernels = 20, [(kind, x) for kind, xs in shared_errors.DECAYS.items() for x in xs]
+    count, kernels = 20, [(kind, x) for kind, xs in DECAYS.items() for x in xs]
     for _ in range(20):
         place, time = rng.normal(size=(count, 2)), np.arange(count, dtype=float)
         parts = [rng.normal(size=(2 * count, 2, count)), np.zeros((2 * count, 3, count))]

@@ -1,0 +1,100 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Is it the device that drifts? By the restricted likelihood (Patterson and Thompson 1971).
+
+Errors that fade in succession are the device's if that is more probable than independent errors,
+or than errors that fade in joint space as those of an arm do: beyond one standard deviation, with
+equal odds before, and any length and size as likely as another, in logarithms.
+
+Residuals r of a part with orthonormal columns Q (`quadratic_forms.py`) and errors of covariance
+v (I + g K), where all other parts have the variance u that independent errors of this one would
+have, have the log likelihood
+
+    -(n log v + log |I + g K| + log |A| + r^T W r - b^T A^-1 b) / 2      W = (I + g K)^-1 / v
+    A = Q^T W Q + (I - Q^T Q) / u      b = Q^T W r - Q^T r / u
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import special
+
+from calib_ros.estimation.fading import DECAYS
+from calib_ros.estimation.levels import SEVERAL, UNUSUAL
+from calib_ros.estimation.quadratic_forms import PartRows
+from calib_ros.estimation.stops import Stops
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.values import SAME
+
+DRIFT_KERNELS = [
+    *(('successive', length) for length in DECAYS['successive']),
+    ('successive', 300.0),
+]
+"""Kinds and lengths of drift. The longest is a random walk to most sessions."""
+ARM_KERNELS = [('near', length) for length in (SAME, *DECAYS['near'])]
+"""Those of errors of the arm; also if only the samples of one stop share them."""
+
+
+def device_drift(part: PartRows, units: Stops) -> FloatArray | None:
+    """Return the expected sizes (1 + K,) of independent errors and DRIFT_KERNELS, or None.
+
+    None unless the device drifts. Averages over all sizes and lengths: a session tells little of
+    a drift that lasts longer.
+    """
+
+    def likely(kernels: Sequence[tuple[str, float]]) -> tuple[FloatArray, FloatArray]:
+        pairs = [likelihoods(part, units.kernel(*each)) for each in kernels]
+        return np.array([each for each, _ in pairs]), np.array([sizes for _, sizes in pairs])
+
+    middle = (every[len(every) // 2] for every in (DRIFT_KERNELS, ARM_KERNELS))
+    drift, arm = (float(likely([each])[0].max()) for each in middle)
+    if not drift > max(arm, 0.0):  # most sessions need no closer look
+        return None
+    (found, sizes), (near, _) = likely(DRIFT_KERNELS), likely(ARM_KERNELS)
+    odds, other = (special.logsumexp(each) - np.log(each.size) for each in (found, near))
+    if not odds - np.logaddexp(0.0, other) > special.logit(1.0 - UNUSUAL):
+        return None
+    white, fading = np.einsum('kr,ksr->sk', special.softmax(found), sizes)
+    return np.append(white.sum(), fading)
+
+
+def likelihoods(part: PartRows, kernel: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return log likelihoods (R,) against independent errors alone, and sizes (2, R).
+
+    The sizes of the independent part and of the kernel K (n, n), for ratios g, each with the most
+    likely v.
+    """
+    basis, residual, known, shares = part
+    rows = np.concatenate([basis, residual[:, :, np.newaxis]], axis=2)
+    ratios, width = np.geomspace(0.02, 50.0, 12), rows.shape[2]
+    products, logs = np.zeros((len(ratios), width, width)), np.zeros(len(ratios))
+    for seen in np.unique(known, axis=1).T:
+        alike = (known == seen[:, np.newaxis]).all(axis=0)
+        values, axes = np.linalg.eigh(kernel * np.outer(seen, seen))
+        weights = 1.0 / (1.0 + np.outer(ratios, np.maximum(values, 0.0)))
+        turned = np.tensordot(axes.T, rows[:, alike], 1)
+        logs -= alike.sum() * np.log(weights).sum(axis=1)
+        for product, weight in zip(products, weights, strict=True):
+            heavy = weight[:, np.newaxis, np.newaxis] * turned
+            product += heavy.reshape(-1, width).T @ turned.reshape(-1, width)
+    own, along, squares = products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]
+    count, others = known.sum(), np.eye(width - 1) - shares
+    moved, free = np.einsum('ncp,nc->p', basis, residual), count - np.trace(shares)
+    alone = (residual**2).sum() / free
+    size = alone / (1.0 + ratios * np.diag(kernel).mean())
+    for _ in range(1 + SEVERAL):
+        ratio = alone / size
+        matrix = own * ratio[:, np.newaxis, np.newaxis] + others
+        vector = along * ratio[:, np.newaxis] - moved
+        inverse = np.linalg.inv(matrix)
+        shift = np.einsum('rpq,rq->rp', inverse, vector)
+        likely = count * np.log(ratio) - logs - np.linalg.slogdet(matrix)[1] + free
+        likely += (np.einsum('rp,rp->r', shift, vector) - squares * ratio) / alone
+        found = np.array([size, ratios * size])
+        left = squares - 2.0 * np.einsum('rp,rp->r', shift, along)
+        left += np.einsum('rp,rpq,rq->r', shift, own, shift)
+        taken = ratio * np.einsum('rpq,rqp->r', inverse, own)
+        size = left / np.maximum(count - taken, 1.0)
+    return 0.5 * likely, found
