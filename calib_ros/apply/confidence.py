@@ -44,18 +44,19 @@ def rms_limits(
     return lower, upper
 
 
-def rms_interval(errors: FloatArray, group: Index) -> tuple[float, float]:
+def rms_interval(errors: FloatArray, group: Index, together: float = 1.0) -> tuple[float, float]:
     """Return the 95 % interval [m] of the RMS of errors (N, 3) over poses like these.
 
     Repeats in a configuration, by `group` (N,), share its error: those with shares w of the pairs
-    tell as much as 1 / sum w^2 alike. With a single one the limits are (0, inf).
+    tell as much as 1 / sum w^2 alike, and so many configurations as are `together` as one. With a
+    single one the limits are (0, inf).
     """
     number = renumber(group)
     moments, shares = moments_of(errors, number), np.bincount(number) / len(number)
     if len(moments) < 2:
         return 0.0, np.inf
     rms = float(np.sqrt(np.mean(norms(errors) ** 2)))
-    freedom = np.array([freedom_of(moments) / np.sum(shares**2)])
+    freedom = np.array([freedom_of(moments) / np.sum(shares**2) / together])
     lower, upper = rms_limits(rms, freedom, CONFIDENT)
     return float(lower[0]), float(upper[0])
 
@@ -64,7 +65,8 @@ def rms_interval(errors: FloatArray, group: Index) -> tuple[float, float]:
 def interval_of(which: Comparison, when: int) -> tuple[float, float]:
     """Return the 95 % interval [m] of the RMS before (0) or after (1), without outliers."""
     residuals, mask = (which.before, which.after)[when], which.deciding
-    return rms_interval(residuals.position[mask], residuals.configurations[mask])
+    errors, numbers = residuals.position[mask], residuals.configurations[mask]
+    return rms_interval(errors, numbers, which.together)
 
 
 def freedom_of(moments: FloatArray) -> float:

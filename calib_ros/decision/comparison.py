@@ -47,13 +47,15 @@ class Comparison(Shown):
 
     Before is the nominal chain with fitted base and tool frames, so that the gain is the arm's.
     `judged` (N,) is False for outliers; `repeated` (N,) is True for held-out pairs at fitted
-    configurations, which count nowhere.
+    configurations, which count nowhere. If the device drifts, so many pairs as are `together` tell
+    as much as one.
     """
 
     before: Residuals
     after: Residuals
     judged: Flags
     repeated: Flags | None = None
+    together: float = 1.0
 
     @property
     def counting(self) -> Flags:
@@ -102,15 +104,22 @@ class Comparison(Shown):
 
 
 def compare(
-    before: Chain, after: Chain, sets: Sequence[Observations], judged: Flags | None = None
+    before: Chain,
+    after: Chain,
+    sets: Sequence[Observations],
+    judged: Flags | None = None,
+    together: float = 1.0,
 ) -> Comparison:
-    """Return the residuals of all sets by both chains; `judged` (N,) is False for outliers."""
+    """Return the residuals of all sets by both chains; `judged` (N,) is False for outliers.
+
+    If the device drifts, so many pairs as are `together` tell as much as one.
+    """
     numbers = np.concatenate(numbered(sets))
     last, first = (  # `after` first: cached after a fit
         joined([residuals(chain, each) for each in sets], numbers) for chain in (after, before)
     )
     every = np.ones(len(numbers), dtype=bool)
-    return Comparison(first, last, every if judged is None else judged)
+    return Comparison(first, last, every if judged is None else judged, together=together)
 
 
 def along_base(found: Comparison, chain: Chain, sets: Sequence[Observations]) -> Comparison:

@@ -60,6 +60,16 @@ def device_drift(part: PartRows, units: Stops) -> FloatArray | None:
     return np.append(white.sum(), fading)
 
 
+def together(units: Stops, sizes: FloatArray) -> float:
+    """Return how many stops tell as much of the noise as one, with sizes (1 + K,) of a drift.
+
+    After Satterthwaite (1946).
+    """
+    pairs = zip(DRIFT_KERNELS, sizes[1:].tolist(), strict=True)
+    noise = sum((v * units.kernel(*each) for each, v in pairs), sizes[0] * np.eye(len(units)))
+    return float(len(units) * (noise**2).sum() / np.trace(noise) ** 2)
+
+
 def likelihoods(part: PartRows, kernel: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return log likelihoods (R,) against independent errors alone, and sizes (2, R).
 

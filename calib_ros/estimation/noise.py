@@ -116,16 +116,16 @@ def noise_of(
     sources = [neighbours.middles.get(k, middle) for k, middle in enumerate(middles)]
     parts = [uncertainty.covariance(factor, middle) for middle in sources]
     by_priors = plain @ extra.T
-    covariance = np.array([*parts, by_priors @ by_priors.T])
-    found = Uncertainty(covariance, freedom)
+    found = Uncertainty(np.array([*parts, by_priors @ by_priors.T]), freedom)
     if neighbours.middles:
         alone = np.sum(plain @ sum(middles, extra.T @ extra) * plain, axis=1)
-        widened = float(np.median(np.sqrt(np.diag(covariance.sum(axis=0)) / alone)))
+        widened = float(np.median(np.sqrt(np.diag(found.covariance) / alone)))
         noise = replace(noise, widened=widened)
         if neighbours.drifting:
             beyond = sum(sources) - widened**2 * sum(middles)
-            found = replace(found, shared=uncertainty.covariance(factor, beyond))
+            shared = uncertainty.covariance(factor, beyond)
+            found = replace(found, shared=shared, together=neighbours.together)
     if estimated.any():
-        size = np.sqrt(np.median(np.diag(covariance.sum(axis=0)) / np.diag(plain)))
+        size = np.sqrt(np.median(np.diag(found.covariance) / np.diag(plain)))
         noise = replace(noise, size=float(size))
     return noise, found

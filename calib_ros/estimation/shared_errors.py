@@ -30,7 +30,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from calib_ros.estimation.drifting import DRIFT_KERNELS, device_drift
+from calib_ros.estimation.drifting import DRIFT_KERNELS, device_drift, together
 from calib_ros.estimation.fading import DECAYS, faded_in_succession, faded_near
 from calib_ros.estimation.leastsquares import Fit
 from calib_ros.estimation.levels import CERTAIN, TELLING
@@ -49,7 +49,8 @@ class Shared:
 
     `successive` and `near` are the larger correlation of residuals of both parts, `found` the
     kinds of neighbours with shared errors by the test, `middles` J^T V J (P, P) of each part (0
-    position, 1 orientation) with shared errors; `drifting` the parts whose are the device's.
+    position, 1 orientation) with shared errors; `drifting` the parts whose are the device's, and
+    `together` how many positions then tell as much of the noise as one.
     """
 
     successive: float
@@ -57,6 +58,7 @@ class Shared:
     found: tuple[str, ...]
     middles: dict[int, FloatArray]
     drifting: tuple[int, ...]
+    together: float
 
 
 def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
@@ -65,7 +67,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     few, stride = gathered(fit.chain, names, system, MOST_STOPS)
     correlations = dict.fromkeys(kinds, 0.0)
     if len(few) < TELLING:
-        return Shared(**correlations, found=(), middles={}, drifting=())
+        return Shared(**correlations, found=(), middles={}, drifting=(), together=1.0)
     extra, _ = system.extra_rows(fit.chain, names)
     forms = QuadraticForms(few, extra, _alike(fit.chain, names, extra))
     limit = special.ndtri(1.0 - (1.0 - CERTAIN) / (len(kinds) * len(forms.parts)))
@@ -84,7 +86,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
                 drifts |= {} if drift is None else {part: drift}
     alike |= {part: ['successive'] for part in drifts}
     if not alike:
-        return Shared(**correlations, found=(), middles={}, drifting=())
+        return Shared(**correlations, found=(), middles={}, drifting=(), together=1.0)
     kernels = {
         part: [(kind, length) for kind in kinds if kind in found for length in DECAYS[kind]]
         for part, found in alike.items()
@@ -107,7 +109,10 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     for part, middle in successive.items():
         middles[part] += middle
     found = tuple(kind for kind in kinds if any(kind in each for each in alike.values()))
-    return Shared(**correlations, found=found, middles=middles, drifting=tuple(drifts))
+    alone = together(few, drifts[0]) if 0 in drifts else 1.0
+    return Shared(
+        **correlations, found=found, middles=middles, drifting=tuple(drifts), together=alone
+    )
 
 
 def _alike(chain: Chain, names: Sequence[str], extra: FloatArray) -> list[list[int]]:

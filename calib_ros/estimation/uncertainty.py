@@ -47,12 +47,14 @@ class Uncertainty(Shown):
     `parts` (K, P, P) belong to position, orientation and priors, or to all of these, to parameters
     held at nominal, and to what no parameter explains; `freedom` (K,) are the degrees of freedom
     of each, infinite if the noise is known. `shared` (F, F) is what errors shared by neighbours
-    add to the covariance by independent noise of one size, of F parameters if there are any.
+    add to the covariance by independent noise of one size, of F parameters if there are any, and
+    `together` the number of positions that tell as much as one, if the device drifts.
     """
 
     parts: FloatArray
     freedom: FloatArray
     shared: FloatArray = field(default_factory=partial(np.zeros, (0, 0)))
+    together: float = 1.0
 
     @property
     def covariance(self) -> FloatArray:

@@ -5,8 +5,9 @@ import pytest
 from fits import NOISE, SIGMAS, UR10E, along_path
 from scipy.linalg import block_diag
 
+from calib_ros.apply.confidence import rms_interval
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.estimation.drifting import device_drift, likelihoods
+from calib_ros.estimation.drifting import device_drift, likelihoods, together
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.quadratic_forms import QuadraticForms
 from calib_ros.estimation.stops import Stops
@@ -97,3 +98,21 @@ def test_ellipsoids_hold_the_truth_though_the_tracker_drifts():
         along = np.einsum('nij,nj->ni', axes, error) / (axes**2).sum(axis=2)
         covered.append(np.mean((along**2).sum(axis=1) <= 1.0))
     assert np.mean(covered) > 0.8
+    assert result.uncertainty.together == result.validation.together > 3.0
+
+
+def test_the_interval_of_an_rms_holds_though_the_device_drifts():
+    rng, count = np.random.default_rng(2), 96
+    units = stops(np.zeros((3, count)), rng.normal(size=(count, 2)), rng)
+    sizes = np.array([0.5, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0])  # over 30 stops
+    alike = together(units, sizes)
+    assert together(units, np.eye(7)[0]) == pytest.approx(1.0)
+    held = []
+    for _ in range(60):
+        drift = faded(units._apart['successive'], 30.0, rng).T
+        errors = np.sqrt(0.5) * (rng.normal(size=(count, 3)) + drift)
+        intervals = [rms_interval(errors, np.arange(count), each) for each in (alike, 1.0)]
+        held.append([lower <= np.sqrt(3.0) <= upper for lower, upper in intervals])
+    covered, alone = np.mean(held, axis=0)
+    assert covered > 0.9
+    assert alone < 0.75
