@@ -28,10 +28,7 @@ from calib_ros.estimation.stops import Stops
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.values import SAME
 
-DRIFT_KERNELS = [
-    *(('successive', length) for length in DECAYS['successive']),
-    ('successive', 300.0),
-]
+DRIFT_KERNELS = [('successive', length) for length in (*DECAYS['successive'], 300.0)]
 """Kinds and lengths of drift. The longest is a random walk to most sessions."""
 ARM_KERNELS = [('near', length) for length in (SAME, *DECAYS['near'])]
 """Those of errors of the arm; also if only the samples of one stop share them."""
@@ -48,13 +45,14 @@ def device_drift(part: PartRows, units: Stops) -> FloatArray | None:
         pairs = [likelihoods(part, units.kernel(*each)) for each in kernels]
         return np.array([each for each, _ in pairs]), np.array([sizes for _, sizes in pairs])
 
-    middle = (every[len(every) // 2] for every in (DRIFT_KERNELS, ARM_KERNELS))
+    least = float(special.logit(1.0 - UNUSUAL))
+    middle = ((kind, lengths[len(lengths) // 2]) for kind, lengths in DECAYS.items())
     drift, arm = (float(likely([each])[0].max()) for each in middle)
-    if not drift > max(arm, 0.0):  # most sessions need no closer look
+    if not drift > max(arm, least):  # few sessions need a closer look
         return None
     (found, sizes), (near, _) = likely(DRIFT_KERNELS), likely(ARM_KERNELS)
     odds, other = (special.logsumexp(each) - np.log(each.size) for each in (found, near))
-    if not odds - np.logaddexp(0.0, other) > special.logit(1.0 - UNUSUAL):
+    if not odds - np.logaddexp(0.0, other) > least:
         return None
     white, fading = np.einsum('kr,ksr->sk', special.softmax(found), sizes)
     return np.append(white.sum(), fading)
