@@ -57,8 +57,8 @@ class Shared:
     near: float
     found: tuple[str, ...]
     middles: dict[int, FloatArray]
-    drifting: tuple[int, ...]
-    together: float
+    drifting: tuple[int, ...] = ()
+    together: float = 1.0
 
 
 def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
