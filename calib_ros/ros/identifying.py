@@ -159,7 +159,8 @@ class Identifying:
             hints = session.last_hints
             hint = next((each.status for each in hints), session.state)
             told_already = why or hints or session.account().foreign_names
-            told = InputError('; '.join((*why, str(err), *(() if told_already else (hint,)))))
+            parts = (*why, str(err), '' if told_already else hint)
+            told = InputError('; '.join(filter(None, parts)))
             self._failed(told, '; '.join(('no poses to fit', *why)), '' if why else hint)
             raise told from err
         samples = tuple(session.usable)
@@ -180,7 +181,7 @@ class Identifying:
         since = None
         with suppress(InputError):
             since = session.since()
-        known = numbers, origin, self._configuration(), session.hints, since
+        known = numbers, origin, self._configuration(), session.last_hints, since
         found = Snapshot(loaded, session.settings, samples, *known)
         self.progress.begin()
         return found

@@ -77,12 +77,12 @@ class Pipeline:
         between = 0 if sampler.rested else self.collector.unused[Cause(POSES, MOVING)]
         return found + (unmeasured(missed, between) if sampler.rested or between else [])
 
-    def unstopped(self) -> list[Hint]:
-        """Tell of a motion with hardly any stop, of which mode continuous takes all."""
+    def unstopped(self, known: int) -> list[Hint]:
+        """Tell of a motion with hardly any of the known stops; mode continuous takes all of it."""
         if self.collector.settings.mode != 'dwell':
             return []
         moving = self.collector.unused[Cause(POSES, MOVING)]
-        return unstopped(self.collector.sampler.rested, moving)
+        return unstopped(known, moving)
 
     def _pass(self, come: Iterable[tuple[Slice, bool]]) -> None:
         error: Exception | None = None

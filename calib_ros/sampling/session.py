@@ -245,7 +245,7 @@ class CalibrationSession:
     @property
     def last_hints(self) -> list[Hint]:
         """Return what looks wrong in a motion that has ended; before it may still stop."""
-        return self.hints or self._pipeline.unstopped()
+        return self.hints or self._pipeline.unstopped(len(self.samples))
 
     @property
     def hints(self) -> list[Hint]:

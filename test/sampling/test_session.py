@@ -35,6 +35,16 @@ def test_samples_are_told_of_as_they_are_taken():
     assert len(heard) == 4
 
 
+def test_hardly_any_stop_is_told_unless_poses_are_known():
+    """Of stops too short but for one the answer was to measure 30 or more."""
+    made = session(shortest_stop=1.0)
+    drive(made, 5, [tracker()])
+    made.restore(samples(2))
+    assert 'hardly any at a stop' in made.last_hints[0].status
+    made.restore(samples(2, start=2))
+    assert made.last_hints == []
+
+
 def test_restored_samples_come_first_and_are_as_good_as_new():
     made = session(samples(15), samples(15, seed=6, start=100))
     whole = session(samples(15, seed=6, start=100))
