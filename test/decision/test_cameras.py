@@ -77,23 +77,18 @@ def test_an_image_of_another_pose_is_an_outlier_and_says_nothing_else(on_flange,
     assert (len(result.outliers), result.refusals, result.remarks) == (len(POINTS), (), ())
 
 
-@pytest.mark.parametrize(
-    ('on_flange', 'seed', 'shares'), [(True, 3, (0.0, 1e-3)), (False, 1, (0.0, 5e-3))]
-)
+@pytest.mark.parametrize(('on_flange', 'seed', 'share'), [(True, 3, 1e-3), (False, 1, 5e-3)])
 def test_joint_values_that_lag_behind_the_images_are_named_before_other_intrinsics(
-    on_flange, seed, shares, single
+    on_flange, seed, share, single
 ):
     """By 0.1 to 5 % of the last move it was the lens, a stretched board, or no cause at all."""
     seen = images(on_flange, seed)
     of_image = seen.joints[:: len(POINTS)]
     moves = np.diff(of_image, axis=0, prepend=of_image[:1])[seen.images]
-    for share in shares:
-        late = replace(seen, joints=seen.joints - share * moves)
-        result = identify(Problem(nominal(on_flange), late, sigma_pixel=0.1))
-        told = [str(each) for each in result.refusals[:1]]
-        assert result.accepted == (share == 0.0)
-        assert all('towards the previous stop' in each for each in told)
-        assert not any('--lens fitted' in each for each in (*result.refusals, *result.remarks))
+    late = replace(seen, joints=seen.joints - share * moves)
+    result = identify(Problem(nominal(on_flange), late, sigma_pixel=0.1))
+    assert 'towards the previous stop' in str(result.refusals[0])
+    assert not any('--lens fitted' in each for each in (*result.refusals, *result.remarks))
 
 
 def test_a_lag_is_named_where_a_lens_to_be_fitted_diverges():

@@ -231,8 +231,7 @@ def test_an_anchor_that_yields_is_named():
     )
 
 
-@pytest.mark.parametrize('jump', [0.005, -0.02])
-@pytest.mark.parametrize('at', [40, 60, 80])
+@pytest.mark.parametrize(('at', 'jump'), [(40, 0.005), (60, -0.02), (80, 0.005)])
 def test_distances_are_right_once_corrected_as_told_of_a_zero_that_moved(at, jump):
     """As two sessions they were refused by their zeros, 24 of 24 times."""
     _, _, seen = in_front(120, 5)
