@@ -84,7 +84,8 @@ def _fit_refusals(
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
         far = some([f'{p.name} by {_far(p, problem.largest_angle)}' for p in beyond])
         text = f'off by more than even a faulty robot of this kind: {", ".join(far)}'
-        yield Reason(Rule.COMMON_SENSE, _other_unit(result) * (len(beyond) > 1) + text)
+        several = sum(p.name.is_length for p in beyond) > 1
+        yield Reason(Rule.COMMON_SENSE, _other_unit(result) * several + text)
 
 
 def _other_unit(result: Identification) -> str:

@@ -227,12 +227,16 @@ def test_rows_in_another_order_do_not_look_like_the_wrong_arm():
     assert Rule.COMMON_SENSE not in rules
 
 
-def test_lengths_that_are_one_multiple_ask_for_the_unit():
-    """Positions in mm, read as inches: the arm was said to be another one."""
+def test_lengths_that_are_one_multiple_ask_for_the_unit(unsearched):
+    """Positions in mm, read as inches: the arm was said to be another one. Held, no length is."""
     *_, seen = measured_arm(3, 60)
-    result = identify(Problem(UR10E, replace(seen, positions=25.4 * seen.positions)))
-    (far,) = [str(each) for each in result.refusals if each.rule is Rule.COMMON_SENSE]
-    assert far.startswith('all lengths come out 25.4 times as long as nominal, as if positions')
+    inches = Problem(UR10E, replace(seen, positions=25.4 * seen.positions))
+    turned = replace(seen, joints=np.add(seen.joints, [0.0, 0.3, 0.0, 0.25, 0.0, 0.0]))
+    held = Problem(UR10E, turned, fixed=('*.a', '*.d'))
+    for problem, said in ((inches, 'all lengths come out 25.4 times as long'), (held, 'off by')):
+        reasons = identify(problem).refusals
+        (far,) = [str(each) for each in reasons if each.rule is Rule.COMMON_SENSE]
+        assert far.startswith(said)
 
 
 @pytest.mark.parametrize('kind', ['base', 'tool'])
