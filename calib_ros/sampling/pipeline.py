@@ -18,7 +18,7 @@ from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.sample_hints import of_two_places
 from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice
 from calib_ros.sampling.stops import MOVING
-from calib_ros.settings import Settings
+from calib_ros.settings import EXCEPTION, Settings
 
 
 class Pipeline:
@@ -72,7 +72,9 @@ class Pipeline:
         """Return what looks wrong with measurements at stops, if no stamps explain it."""
         sampler, missed = self.collector.sampler, self.collector.unmeasured
         stops = sampler.restless + sampler.rested
-        found = of_two_places(sampler.doubled, 0.5 * stops)  # most of them, by turns
+        far = [spread for spread in sampler.doubled if spread > Settings.largest_error]
+        found = of_two_places(far, EXCEPTION * stops)  # these gave no pose
+        found = found or of_two_places(sampler.doubled, 0.5 * stops)  # most of them, by turns
         found = found or unsettled(sampler.restless, stops)
         between = 0 if sampler.rested else self.collector.unused[Cause(POSES, MOVING)]
         return found + (unmeasured(missed, between) if sampler.rested or between else [])

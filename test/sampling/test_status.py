@@ -9,7 +9,7 @@ import pytest
 from fits import NOISE
 from recorded import pose_with_covariance
 from sessions import SIGMAS, TRUE, UR5E, drive, samples, session, tracker
-from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, take
+from streams import POSE, START, TRACKER, joint_state, of_joints, pose, stamps, stops, take
 
 from calib_ros.apply.simulation import measure
 from calib_ros.errors import InputError
@@ -47,23 +47,27 @@ def test_measurements_of_two_places_are_told(spread, size, told):
 
 
 @pytest.mark.parametrize(
-    ('apart', 'noise', 'told'),
-    [(1e-3, 0.0, '0.29'), (2e-2, 1e-3, '5.8'), (1e-4, 0.0, ''), (0.0, 1e-3, ''), (2e-3, 5e-4, '')],
+    ('apart', 'noise', 'count', 'told'),
+    [
+        *[(1e-3, 0.0, 30, '0.29'), (2e-2, 1e-3, 30, '5.8'), (0.3, 0.0, 8, '87')],
+        *[(1e-4, 0.0, 30, ''), (0.0, 1e-3, 30, ''), (2e-3, 5e-4, 30, '')],
+    ],
 )
-def test_two_devices_close_together_are_told_by_their_turns(apart, noise, told):
-    """Less than 35 mm apart they were averaged and accepted without a word."""
+def test_two_devices_are_told_by_their_turns(apart, noise, count, told):
+    """Close together they were averaged and accepted; far apart they were stops that shake."""
     made, rng, turns = CalibrationSession(UR5E), np.random.default_rng(7), itertools.count()
 
     def message(stamp, row):
         found = measure(TRUE, row[np.newaxis], rng, *NOISE)
-        where = found.positions[0] + [0.0, 0.0, (next(turns) % 2) * apart]
+        second = next(turns) % 2 and stamp < START + round(1.6e9 * count)
+        where = found.positions[0] + [0.0, 0.0, second * apart]
         return pose(stamp, where + rng.normal(scale=noise, size=3), found.rotations[0])
 
     drive(made, 30, [(TRACKER, POSE, message)])
     made.finish()
-    assert len(made.samples) == 30
+    assert len(made.samples) == (30 if apart < 0.1 else 30 - count)
     assert ('two devices or targets' in made.status()) == bool(told)
-    assert f'measurements at 30 stops scatter by {told} mm' in made.summary or not told
+    assert f'measurements at {count} stops scatter by {told} mm' in made.summary or not told
 
 
 def test_the_status_tells_how_far_it_is():
