@@ -221,8 +221,8 @@ def verdict_in_words(found: Judgement) -> str:
             if found.overstated:
                 return f'no verdict: {found.overstated}; {told}'
             return (
-                f'the device has too much noise to tell: {told}; use one as accurate as that of '
-                'the calibration'
+                f'the device has too much noise to tell: {told}; use a device as accurate as that '
+                'of the calibration'
             )
         return f'too few poses to tell whether the calibration holds: {told}; measure more'
     turned = turned_in_words(now)

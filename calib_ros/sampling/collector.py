@@ -219,7 +219,7 @@ class Collector:
         stands = self.track.standing(self.settings.still, REST_S)
         newest = self.track.newest_ns
         if not newest:
-            return 0, 'no joint states of all joints received: see ~/status'
+            return 0, 'no joint states of this arm received: see ~/status'
         shortest = round(self.settings.shortest_stop * 1e9)
         stopped = len(stands) and stands[-1, 1] >= newest
         if not stopped or newest - self._begin(stands) < shortest:

@@ -80,7 +80,7 @@ class Pipeline:
         return found + (unmeasured(missed, between) if sampler.rested or between else [])
 
     def unstopped(self, known: int) -> list[Hint]:
-        """Tell of a motion with hardly any of the known stops; mode continuous takes all of it."""
+        """Tell of motion with hardly any stop, by the `known` poses; mode continuous takes all."""
         if self.collector.settings.mode != 'dwell':
             return []
         moving = self.collector.unused[Cause(POSES, MOVING)]

@@ -98,7 +98,7 @@ def test_noise_that_no_number_of_poses_overcomes_asks_for_no_more_of_them():
     assert verdict_in_words(replace(found, noise=1e-4)).endswith('; measure more')  # they decide
     told = verdict_in_words(replace(found, noise=1e-4, needed=None))
     assert told.startswith('the device has too much noise to tell')
-    assert told.endswith('use one as accurate as that of the calibration')
+    assert told.endswith('use a device as accurate as that of the calibration')
 
 
 def test_a_mistake_is_named_instead_of_a_verdict():

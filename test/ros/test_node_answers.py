@@ -38,7 +38,7 @@ JOINT_RATE = 25.0  # they cost more than what is asked
 def test_errors_are_answers(cell, recording):
     for name, said in (
         ('identify', 'check joint_topics, sources, their types and QoS$'),
-        ('capture', 'no joint states of all joints received'),
+        ('capture', 'no joint states of this arm received'),
         ('remove_last', 'no pose to remove'),
         ('validate', 'identify or load one first'),
         ('load', '~/save first, or set calibration_filename'),

@@ -190,7 +190,7 @@ def test_a_long_stand_is_known_from_its_begin(way):
 def test_a_capture_that_gives_nothing_says_why():
     motion = tour()
     made = collector(mode='triggered')
-    assert made.capture() == (0, 'no joint states of all joints received: see ~/status')
+    assert made.capture() == (0, 'no joint states of this arm received: see ~/status')
     play(made, joint_events(motion, 0.5), finish=False)
     assert made.capture() == (0, 'no measurements since the last pose')
     events = joint_events(motion, 1.5, begin=0.5), pose_events(motion, 1.5, begin=0.5)
