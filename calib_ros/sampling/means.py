@@ -28,7 +28,7 @@ class Means:
     rests: Flags  # (S,) False if measurements spread more than noise
     values: FloatArray  # (S, 3) or (S, 1) [m]
     spreads: FloatArray  # (S,) RMS of one coordinate about the mean [m]
-    doubled: Flags  # (S,) True if measurements are of two places by turns
+    doubled: Flags  # (S,) True if measurements are of several places by turns
 
 
 def averages(values: FloatArray, begins: Index, sigmas: FloatArray) -> Means:
@@ -56,7 +56,7 @@ def averages(values: FloatArray, begins: Index, sigmas: FloatArray) -> Means:
     doubled = (ends - begins >= TELLING) & (spreads > MOST_SPREAD * sigmas)
     for k in np.flatnonzero(doubled).tolist():
         part = slice(begins[k], ends[k])
-        doubled[k] = _in_two_places(values[part][used[part]])
+        doubled[k] = _in_heaps(values[part][used[part]])
     return Means(used, rests & (spreads <= limits), means, spreads, doubled)
 
 
@@ -77,15 +77,18 @@ def _noise(values: FloatArray) -> float:
     return float(1.4826 * np.sqrt((noise**2).mean()))  # the median: spikes do not count
 
 
-def _in_two_places(values: FloatArray) -> bool:
-    """Tell whether values lie in two heaps, ten times their size apart, as no noise does.
+def _in_heaps(values: FloatArray) -> bool:
+    """Tell whether values (N, w) lie in two heaps or more, ten times their size apart.
 
-    The rest of the variance within the heaps is 4 % then; 36 % of Gaussian noise, 19 % of a swing.
+    No noise does: of two parts Gaussian noise leaves 36 % of the variance within them, a swing
+    19 %, heaps 4 %; of more parts each leaves less.
     """
-    along = (values - values.mean(axis=0)) @ np.linalg.svd(values - values.mean(axis=0))[2][0]
-    heaps = along[along > 0.0], along[along <= 0.0]
-    within = sum(((heap - heap.mean()) ** 2).sum() for heap in heaps if heap.size)
-    return bool(within < 0.5 * EXCEPTION * (along**2).sum())
+    away = values - values.mean(axis=0)
+    along = np.sort(away @ np.linalg.svd(away, full_matrices=False)[2][0])
+    heaps = np.split(along, 1 + np.flatnonzero(np.diff(along) > 0.5 * along.std()))
+    within = sum(((heap - heap.mean()) ** 2).sum() for heap in heaps)
+    most = 2.0 * EXCEPTION * (along**2).sum() / len(heaps) ** 2
+    return bool(FEW * len(heaps) <= len(along) and within < most)
 
 
 def _settled(values: FloatArray, reach: float) -> int:

@@ -74,7 +74,8 @@ class Pipeline:
         stops = sampler.restless + sampler.rested
         far = [spread for spread in sampler.doubled if spread > Settings.largest_error]
         found = of_two_places(far, EXCEPTION * stops)  # these gave no pose
-        found = found or of_two_places(sampler.doubled, 0.5 * stops)  # most of them, by turns
+        most = 0.5 * (sampler.rested + len(far))
+        found = found or of_two_places(sampler.doubled, most)  # by regular turns
         found = found or unsettled(sampler.restless, stops)
         between = 0 if sampler.rested else self.collector.unused[Cause(POSES, MOVING)]
         return found + (unmeasured(missed, between) if sampler.rested or between else [])

@@ -64,7 +64,7 @@ class Sampler:
         self._shaken = math.inf  # the number of that stop
         self.dropped: Counter[Cause] = Counter()
         self.rested = self.restless = 0  # stops with measurements at rest, and not
-        self.doubled: list[float] = []  # spreads [m] of those in two places by turns
+        self.doubled: list[float] = []  # spreads [m] of those in several places by turns
 
     def samples(self, found: Found) -> Iterator[Numbered]:
         """Yield a sample of the measurements of each stop, unless they spread too much."""
@@ -90,7 +90,7 @@ class Sampler:
             begin, count, number, stamp_ns, left_out, rests, spread = row
             if rests and means.doubled[k]:
                 self.doubled.append(spread)
-                rests = spread <= Settings.largest_error  # else the mean is far from both
+                rests = spread <= Settings.largest_error  # else the mean is far from each
             if left_out or not rests:
                 self._shaken = min(self._shaken, number)
             if not rests:
