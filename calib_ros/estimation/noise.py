@@ -118,8 +118,8 @@ def noise_of(
     by_priors = plain @ extra.T
     found = Uncertainty(np.array([*parts, by_priors @ by_priors.T]), freedom)
     if neighbours.middles:
-        alone = np.sum(plain @ sum(middles, extra.T @ extra) * plain, axis=1)
-        widened = float(np.median(np.sqrt(np.diag(found.covariance) / alone)))
+        alone = uncertainty.covariance(factor, sum(middles, extra.T @ extra))
+        widened = float(np.median(np.sqrt(np.diag(found.covariance) / np.diag(alone))))
         noise = replace(noise, widened=widened)
         if neighbours.drifting:
             beyond = sum(sources) - widened**2 * sum(middles)

@@ -15,7 +15,7 @@ from calib_ros.estimation import noise as noise_module
 from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.levels import chance_of
 from calib_ros.estimation.noise import Noise, noise_of
-from calib_ros.estimation.normal import triangular_factor
+from calib_ros.estimation.normal import normal_equations, triangular_factor
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.shared_errors import Shared
@@ -159,6 +159,21 @@ def test_a_part_with_less_than_one_degree_of_freedom_tells_its_noise():
     assert freedom[least] == pytest.approx(0.5, abs=1e-3)
     expected = tuple(np.sqrt(squares / freedom))
     assert (noise.position, noise.orientation) == pytest.approx(expected, rel=1e-6)
+
+
+def test_what_neighbours_share_is_finite_though_hardly_anything_tells_a_parameter(monkeypatch):
+    """As of a joint whose only poses elsewhere are gross errors, before it has a prior."""
+    rng = np.random.default_rng(0)
+    seen = measure(UR10E, UR10E.random_joints(30, rng), rng, *NOISE)
+    names, system = [*NAMES, 'shoulder_pan_joint.theta'], System((Samples(seen, *NOISE),))
+    fit = minimise(UR10E, names[:-1], system)
+    fit = replace(fit, normal=normal_equations(fit.chain, names, system))
+    shared = Shared(0.5, 0.0, ('successive',), {0: 4.0 * fit.normal.parts[0]}, (0,), 9.0)
+    monkeypatch.setattr(noise_module, 'shared_errors', lambda *_: shared)
+    factor = triangular_factor(fit.chain, names, system)  # with the base's rz it is singular
+    noise, uncertainty = noise_of(fit, names, system, factor)
+    assert np.isfinite(noise.widened)
+    assert np.isfinite(uncertainty.shared).all()
 
 
 def test_the_noise_of_either_part_is_told_from_the_products_of_rows(rng):
