@@ -58,14 +58,16 @@ def device_drift(part: PartRows, units: Stops) -> FloatArray | None:
     return np.append(white.sum(), fading)
 
 
-def together(units: Stops, sizes: FloatArray) -> float:
+def together(units: Stops, lengths: Sequence[int], sizes: FloatArray) -> float:
     """Return how many stops tell as much of the noise as one, with sizes (1 + K,) of a drift.
 
-    After Satterthwaite (1946).
+    Of sets of so many stops; `units` may be some of them. After Satterthwaite (1946).
     """
-    pairs = zip(DRIFT_KERNELS, sizes[1:].tolist(), strict=True)
-    noise = sum((v * units.kernel(*each) for each, v in pairs), sizes[0] * np.eye(len(units)))
-    return float(len(units) * (noise**2).sum() / np.trace(noise) ** 2)
+    apart = np.arange(max(lengths))
+    pairs = np.maximum(np.subtract.outer(lengths, apart), 0).sum(axis=0)
+    fading = sizes[1:] @ np.exp([-apart / length for _, length in DRIFT_KERNELS])
+    shares = fading / (sizes[0] / units.count.mean() + fading[0])
+    return float(1.0 + 2.0 * pairs[1:] @ shares[1:] ** 2 / pairs[0])
 
 
 def likelihoods(part: PartRows, kernel: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -109,7 +109,8 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     for part, middle in successive.items():
         middles[part] += middle
     found = tuple(kind for kind in kinds if any(kind in each for each in alike.values()))
-    alone = together(few, drifts[0]) if 0 in drifts else 1.0
+    lengths = [int(samples.observations.stops[-1]) + 1 for samples in system.sets]
+    alone = together(few, lengths, drifts[0]) if 0 in drifts else 1.0
     return Shared(
         **correlations, found=found, middles=middles, drifting=tuple(drifts), together=alone
     )

@@ -105,8 +105,8 @@ def test_the_interval_of_an_rms_holds_though_the_device_drifts():
     rng, count = np.random.default_rng(2), 96
     units = stops(np.zeros((3, count)), rng.normal(size=(count, 2)), rng)
     sizes = np.array([0.5, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0])  # over 30 stops
-    alike = together(units, sizes)
-    assert together(units, np.eye(7)[0]) == pytest.approx(1.0)
+    alike = together(units, [count], sizes)
+    assert together(units, [count], np.eye(7)[0]) == 1.0
     held = []
     for _ in range(60):
         drift = faded(units._apart['successive'], 30.0, rng).T
@@ -116,3 +116,16 @@ def test_the_interval_of_an_rms_holds_though_the_device_drifts():
     covered, alone = np.mean(held, axis=0)
     assert covered > 0.9
     assert alone < 0.75
+
+
+def test_of_many_stops_as_many_tell_as_much_as_one_as_of_few():
+    """Of some stops, in runs of twenty, most pairs would be missing."""
+    rng, sizes = np.random.default_rng(0), np.array([1.0, 0.0, 0.0, 0.0, 0.3, 0.2, 0.0])
+    units = stops(np.zeros((3, 20)), np.zeros((20, 1)), rng)
+    units.count[:] = 2.0
+    for lengths in ([100, 40], [1000, 1000]):
+        apart = np.abs(np.subtract.outer(*[np.arange(max(lengths))] * 2))
+        noise = 0.5 * np.eye(max(lengths)) + 0.3 * np.exp(-apart / 30.0)
+        noise += 0.2 * np.exp(-apart / 100.0)
+        squares = sum(np.sum(noise[:count, :count] ** 2) for count in lengths)
+        assert together(units, lengths, sizes) == pytest.approx(squares / sum(lengths))
