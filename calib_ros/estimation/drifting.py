@@ -3,8 +3,8 @@
 """Is it the device that drifts? By the restricted likelihood (Patterson and Thompson 1971).
 
 Errors that fade in succession are the device's if that is more probable than independent errors,
-or than errors that fade in joint space as those of an arm do: beyond one standard deviation, with
-equal odds before, and any length and size as likely as another, in logarithms.
+or than errors that fade in joint space as those of an arm do, or not at all: beyond one standard
+deviation, with equal odds before, and any length and size as likely as another, in logarithms.
 
 Residuals r of a part with orthonormal columns Q (`quadratic_forms.py`) and errors of covariance
 v (I + g K), where all other parts have the variance u that independent errors of this one would
@@ -30,8 +30,9 @@ from calib_ros.values import SAME
 
 DRIFT_KERNELS = [('successive', length) for length in (*DECAYS['successive'], 300.0)]
 """Kinds and lengths of drift. The longest is a random walk to most sessions."""
-ARM_KERNELS = [('near', length) for length in (SAME, *DECAYS['near'])]
-"""Those of errors of the arm; also if only the samples of one stop share them."""
+ARM_KERNELS = [('near', length) for length in (SAME, *DECAYS['near'], 300.0)]
+"""Those of errors of the arm; also if only the samples of one stop share them, or all poses: of
+distances no frame takes a constant error."""
 
 
 def device_drift(part: PartRows, units: Stops) -> FloatArray | None:

@@ -81,6 +81,17 @@ def test_a_drift_of_the_device_is_told_from_errors_of_the_arm(order):
         assert device_drift(QuadraticForms(units, np.zeros((0, 5))).parts[0], units) is None
 
 
+def test_an_error_of_all_poses_is_no_drift():
+    """As of a wire whose zero is off, or of a soft arm by one: no frame takes it."""
+    rng, count = np.random.default_rng(0), 96
+    q = UR10E.random_joints(count, rng)
+    errors = 1.0 + 0.5 * rng.normal(size=(3, count))
+    units = stops(errors, np.concatenate([np.cos(q), np.sin(q)], axis=1), rng)
+    part = QuadraticForms(units, np.zeros((0, 5))).parts[0]
+    assert likelihoods(part, units.kernel('successive', 300.0))[0].max() > 20.0
+    assert device_drift(part, units) is None
+
+
 def test_ellipsoids_hold_the_truth_though_the_tracker_drifts():
     """The frames follow a slow drift, more than noise of the same median makes them expect."""
     covered = []
