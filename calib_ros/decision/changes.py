@@ -30,7 +30,7 @@ import copy
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, groupby
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -193,7 +193,7 @@ def reasons_of(
     likely, times = zip(*evidences, strict=True)
     logs = np.subtract(likely, [np.log(tried[owner]) for owner, _ in columns.sets])
     found = [
-        _explanation(information, columns, freedom, *each, *rest)
+        explanation_of(information, columns, freedom, *each, *rest)
         for each, *rest in zip(columns.sets, special.softmax(logs).tolist(), times, strict=True)
     ]
     doubted = most < 1.0 and max(logs) <= 0.0
@@ -204,7 +204,7 @@ def reasons_of(
     return tuple(each for each in found if each.share > 1.0 - CONFIDENT) or (found[0],)
 
 
-def _explanation(
+def explanation_of(
     information: Information,
     columns: ChangeColumns,
     freedom: float,
@@ -213,49 +213,12 @@ def _explanation(
     share: float = 1.0,
     times: float | None = None,
 ) -> Explanation:
+    """Return the explanation by parameters of an owner; `times` typical ones, or the likeliest."""
     gain, change, covariance, rank = information.explained(columns.of(names))
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     chance = min(1.0, len(columns.sets) * chance_of(gain, rank, freedom))
     times = columns.evidence(information, names)[1] if times is None else times
     return Explanation(owner, names, gain, chance, share, change, sigma, times)
-
-
-def likelier(
-    information: Information,
-    columns: ChangeColumns,
-    freedom: float,
-    changed: list[tuple[Explanation, ...]],
-) -> list[tuple[Explanation, ...]]:
-    """Return changes found one by one, or those of a few or all joint zeros if likelier.
-
-    The best single explanation of several changed zeros may be another. Each change is chosen from
-    all explanations, a bent link counting once; all zeros count as one more than SEVERAL.
-    """
-    if not changed:
-        return changed
-    given = [reasons[0].names for reasons in changed]
-    single = [(name,) for name in columns.zeros]
-    tried = [given]
-    tried += [list(some) for k in range(2, SEVERAL + 1) for some in combinations(single, k)]
-    tried += [[columns.zeros]] * (len(single) > SEVERAL)  # of fewer all are among these
-    # a link with parts of a neighbouring joint is the same link
-    choices = sum(owner in (LOAD, own[-1].owner) for owner, own in columns.sets)
-
-    def likely(causes: Sequence[Sequence[Parameter]]) -> float:
-        count = SEVERAL + 1 if causes == [columns.zeros] else len(causes)
-        names = [name for each in causes for name in each]
-        return columns.evidence(information, names)[0] - count * float(np.log(choices))
-
-    best = max(tried, key=likely)
-    if best is given:
-        return changed
-    pairs = [(own[0].owner if len(own) == 1 else 'all joints', own) for own in best]
-    rough = [(_explanation(information, columns, freedom, *pair),) for pair in pairs]
-    found: list[tuple[Explanation, ...]] = []
-    for k, pair in enumerate(pairs):
-        alone = information.marginalised(columns.covariance([*rough[:k], *rough[k + 1 :]]))
-        found.append((_explanation(alone, columns, freedom, *pair),))
-    return found
 
 
 class ChangeColumns:

@@ -5,7 +5,7 @@
 Frames are free: device and target may have been moved. The second arm is expressed in the
 parameters of the first by a fit to its poses over the joint range, which removes gauge freedoms.
 The parameter difference d is tested by d^T C^-1 d with C = C_1 + C_2; then the changed parameters
-are searched for (`changes.py`). The difference of predicted positions, in the best frames, is a
+are searched for (`several.py`). The difference of predicted positions, in the best frames, is a
 quadratic form of d; its limit is the quantile for d ~ N(d, C).
 
 Wobble that the models lack is the same in both, so C has the covariance of the difference of its
@@ -26,10 +26,11 @@ from calib_ros.annotated import as_annotated
 from calib_ros.decision import changes
 from calib_ros.decision.another import is_another
 from calib_ros.decision.changes import ChangeColumns, Explanation, Information
+from calib_ros.decision.several import likelier, one_by_one
 from calib_ros.errors import InputError
 from calib_ros.estimation.gain import inverse_root
 from calib_ros.estimation.identifiability import structurally_independent
-from calib_ros.estimation.levels import CONFIDENT, SCALE, SEVERAL, chance_of
+from calib_ros.estimation.levels import CONFIDENT, SCALE, chance_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.posterior import size_group
 from calib_ros.estimation.sizes import TYPICAL
@@ -140,18 +141,15 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     square, lacking = _squares((first, second), names)
     freedom = min(first.freedom, second.freedom)
     columns = ChangeColumns(chain, names, scaled=True)
-    every = left_over = _information(names, change, square)
+    every = _information(names, change, square)
     chance = _chance(every, freedom)
     beyond = _chance(_information(names, change, lacking), freedom)
-    changed: list[tuple[Explanation, ...]] = []
-    while len(changed) < SEVERAL and (reasons := changes.reasons_of(left_over, columns, freedom)):
-        changed.append(reasons)
-        left_over = every.marginalised(columns.covariance(changed))
-    for k, given in enumerate(changed if len(changed) > 1 else ()):  # the first took from others
-        others = columns.covariance(changed[:k] + changed[k + 1 :])
-        again = changes.reasons_of(every.marginalised(others), columns, freedom)
-        changed[k] = again or given
-    changed = changes.likelier(every, columns, freedom, changed)
+
+    def reasons_beside(found: Sequence[tuple[Explanation, ...]]) -> tuple[Explanation, ...]:
+        left_over = every.marginalised(columns.covariance(found))
+        return changes.reasons_of(left_over, columns, freedom)
+
+    changed = likelier(every, columns, freedom, one_by_one(reasons_beside))
     left_over = every.marginalised(columns.covariance(changed))
     another = is_another(every, columns, changed, first.chain, first.before)
     predicted = changes.mean_square_change(chain, names)

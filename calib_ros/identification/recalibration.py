@@ -29,6 +29,7 @@ from calib_ros.decision.changes import SCALES, ChangeColumns, Explanation, Infor
 from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.decision.cross_validation import fold_residuals
 from calib_ros.decision.residuals import residuals
+from calib_ros.decision.several import likelier, one_by_one
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.gain import about_nominal
@@ -272,24 +273,20 @@ class _Arm:
         self, information: Information, columns: ChangeColumns
     ) -> list[tuple[Explanation, ...]]:
         """Return what has changed, each with its likely explanations."""
-        found: list[tuple[Explanation, ...]] = []
-        while reasons := self.widened(columns, found).reasons(information, columns):
-            if reasons[0].names[0] in SCALES and abs(reasons[0].change[0]) < SCALE:
-                columns = columns.unscaled()  # as much is usual
-            elif len(found) < SEVERAL:
-                found.append(reasons)
-            else:
-                break
+        found = one_by_one(lambda some: self.widened(columns, some).reasons(information, columns))
         left_over = information.marginalised(self.doubted)
-        return changes.likelier(left_over, columns, self.previous.freedom, found)
+        return likelier(left_over, columns, self.previous.freedom, found)
 
     def reasons(self, information: Information, columns: ChangeColumns) -> tuple[Explanation, ...]:
         """Return what has changed; of possible device errors only another scale."""
         freedom = self.previous.freedom
         found = changes.reasons_of(information.marginalised(self.square), columns, freedom)
-        if found and found[0].names == SCALES[:1]:
-            return found
-        return changes.reasons_of(information.marginalised(self.doubted), columns, freedom)
+        if not (found and found[0].names == SCALES[:1]):
+            left_over = information.marginalised(self.doubted)
+            found = changes.reasons_of(left_over, columns, freedom)
+        if found and found[0].names[0] in SCALES and abs(found[0].change[0]) < SCALE:
+            return self.reasons(information, columns.unscaled())  # as much is usual
+        return found
 
     @property
     def own(self) -> list[int]:

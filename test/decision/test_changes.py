@@ -3,12 +3,10 @@
 """Effects of changes and their evidence. `test_recalibration.py` has the changes themselves."""
 
 from collections import Counter
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from fits import SCARA, UR10E
-from scipy import optimize
 
 from calib_ros import load_chain
 from calib_ros.decision import changes
@@ -18,7 +16,6 @@ from calib_ros.decision.changes import (
     Explanation,
     Information,
     gauge_columns,
-    likelier,
     mean_square_change,
     reasons_of,
     root_of,
@@ -191,31 +188,6 @@ def test_the_scale_of_the_device_is_that_of_all_lengths():
     assert not any(owner == 'device' for owner, _ in ChangeColumns(UR10E, THREE, scaled=True).sets)
 
 
-@pytest.mark.parametrize(
-    ('change', 'first', 'wanted'),
-    [
-        ((2e-3, 0.0, 0.0), (0,), (0,)),
-        ((2e-3, -2e-3, 0.0), (2,), (0, 1)),
-        ((2e-3, -2e-3, 0.0), (0, 1), (0, 1)),  # as found one by one
-        ((2e-3, -2e-3, 3e-3), (0, 1), (0, 1, 2)),
-    ],
-)
-def test_the_fewest_zeros_that_explain_all_are_likelier(change, first, wanted, rng):
-    information, columns = known(rng, np.array(change)), ChangeColumns(UR10E, THREE)
-    one = SimpleNamespace
-    given = [(one(names=(THREE[k],)),) for k in first]
-    found = likelier(information, columns, 100.0, given)
-    assert [reasons[0].names for reasons in found] == [(THREE[k],) for k in wanted]
-    if first == wanted:
-        assert found is given
-        return
-    for (each,), k in zip(found, wanted, strict=True):
-        assert (each.owner, each.share) == (THREE[k].owner, 1.0)
-        assert each.change == pytest.approx(change[k], abs=5.0 * each.sigma[0])
-        assert 1e-6 < each.sigma[0] < 1e-4
-    assert likelier(information, columns, 100.0, []) == []
-
-
 @pytest.mark.parametrize('size', [1e-6, 2e-5, 3e-5])
 def test_the_chance_of_an_explanation_is_that_of_all_that_are_tried(size, rng):
     information, columns = known(rng, np.array([0.0, size, 0.0])), ChangeColumns(UR10E, THREE)
@@ -250,35 +222,6 @@ def test_what_is_outside_the_arm_is_tried_as_often_as_the_joint_that_is_tried_mo
     wanted = np.sort(odds / odds.sum())[::-1][: len(found)]
     assert [each.share for each in found] == pytest.approx(wanted.tolist())
     assert 'device' in {each.owner for each in found}
-
-
-def test_the_zeros_of_all_joints_are_one_change(rng):
-    names = [joint.driven for joint in UR10E.joints[1:5]]
-    information = known(rng, np.full(4, 3e-3), names=names)
-    given = [(SimpleNamespace(names=(names[0],)),)]
-    ((found,),) = likelier(information, ChangeColumns(UR10E, names), 100.0, given)
-    assert (found.owner, list(found.names)) == ('all joints', names)
-
-
-@pytest.mark.parametrize('odds', [0.96, 1.04])
-@pytest.mark.parametrize(('count', 'choices'), [(2, 5), (4, 7)])
-def test_one_change_more_must_be_likelier_than_any_of_as_many(count, choices, odds):
-    """All zeros count as one more than any three of them, a link with parts of the next once."""
-    names = [joint.driven for joint in UR10E.joints[1 : 1 + count]]
-    names += [Parameter('elbow_joint.a'), Parameter('elbow_joint.alpha')]
-    columns, matrix = ChangeColumns(UR10E, names), 1e10 * np.eye(count + 2)
-    change = np.array([*[3e-3] * (count - 1), 0.0, 0.0, 0.0])
-
-    def evidence(size):
-        change[count - 1] = size
-        information = Information(tuple(names), matrix, matrix @ change)
-        return columns.evidence(information, [names[count - 1]])[0]
-
-    optimize.brentq(lambda size: evidence(size) - odds * np.log(choices), 1e-7, 1e-3)
-    given = [(SimpleNamespace(names=(name,)),) for name in names[: count - 1]]
-    found = likelier(Information(tuple(names), matrix, matrix @ change), columns, 100.0, given)
-    told = [name for (each,) in found for name in each.names]
-    assert told == names[: count if odds > 1.0 else count - 1]
 
 
 def test_the_square_of_a_change_is_that_of_positions_in_the_best_frames():
