@@ -305,7 +305,8 @@ class ChangeColumns:
         found = []
         for k in range(SEVERAL):
             few = min(k, 1)
-            times = {n: SPREAD ** (few if n.of_dh and n not in self.zeros else k) for n in names}
+            most = {n: few if n.of_dh or n in SCALES else k for n in names}
+            times = {n: SPREAD ** (k if n in self.zeros else most[n]) for n in names}
             found.append((information.evidence(self.root(times)) - 0.5 * k**2, SPREAD**k))
         return max(found)
 

@@ -103,9 +103,8 @@ def noise_of(
     extra, _ = system.extra_rows(fit.chain, names)
     if system.prior is not None:
         extra[: len(names)] *= system.prior.noise
-    estimated = np.array(
-        [not consistent or sizes[k] != 1.0 or k in neighbours.middles for k in (0, 1)]
-    )
+    alike = neighbours.middles.keys() | neighbours.drifting.keys()
+    estimated = np.array([not consistent or sizes[k] != 1.0 or k in alike for k in (0, 1)])
     seen = np.where(together > SUSPICIOUS, joint_counts, counts)
     freedom = np.maximum(seen - taken, 1.0)
     freedom = np.append(np.where(estimated, freedom, np.inf), np.inf)
@@ -121,10 +120,10 @@ def noise_of(
         alone = uncertainty.covariance(factor, sum(middles, extra.T @ extra))
         widened = float(np.median(np.sqrt(np.diag(found.covariance) / np.diag(alone))))
         noise = replace(noise, widened=widened)
-        if neighbours.drifting:
-            beyond = sum(sources) - widened**2 * sum(middles)
-            shared = uncertainty.covariance(factor, beyond)
-            found = replace(found, shared=shared, together=neighbours.together)
+    if neighbours.drifting:
+        drift = sum(neighbours.drifting.get(k, source) for k, source in enumerate(sources))
+        shared = uncertainty.covariance(factor, drift - noise.widened**2 * sum(middles))
+        found = replace(found, shared=shared, together=neighbours.together)
     if estimated.any():
         size = np.sqrt(np.median(np.diag(found.covariance) / np.diag(plain)))
         noise = replace(noise, size=float(size))

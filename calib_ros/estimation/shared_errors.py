@@ -24,8 +24,9 @@ If the device drifts (`drifting.py`), the sizes are those of its errors.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from scipy import special
@@ -36,7 +37,7 @@ from calib_ros.estimation.leastsquares import Fit
 from calib_ros.estimation.levels import CERTAIN, TELLING
 from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.quadratic_forms import QuadraticForms
-from calib_ros.estimation.stops import MOST_STOPS, gather, gathered
+from calib_ros.estimation.stops import MOST_STOPS, Stops, gather, gathered
 from calib_ros.estimation.system import System
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
@@ -49,15 +50,15 @@ class Shared:
 
     `successive` and `near` are the larger correlation of residuals of both parts, `found` the
     kinds of neighbours with shared errors by the test, `middles` J^T V J (P, P) of each part (0
-    position, 1 orientation) with shared errors; `drifting` the parts whose are the device's, and
-    `together` how many positions then tell as much of the noise as one.
+    position, 1 orientation) with shared errors; `drifting` those of the parts whose errors are a
+    drift of the device, and `together` how many positions then tell as much of the noise as one.
     """
 
     successive: float
     near: float
     found: tuple[str, ...]
     middles: dict[int, FloatArray]
-    drifting: tuple[int, ...] = ()
+    drifting: dict[int, FloatArray] = field(default_factory=dict)
     together: float = 1.0
 
 
@@ -67,7 +68,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     few, stride = gathered(fit.chain, names, system, MOST_STOPS)
     correlations = dict.fromkeys(kinds, 0.0)
     if len(few) < TELLING:
-        return Shared(**correlations, found=(), middles={}, drifting=(), together=1.0)
+        return Shared(**correlations, found=(), middles={}, drifting={}, together=1.0)
     extra, _ = system.extra_rows(fit.chain, names)
     forms = QuadraticForms(few, extra, _alike(fit.chain, names, extra))
     limit = special.ndtri(1.0 - (1.0 - CERTAIN) / (len(kinds) * len(forms.parts)))
@@ -84,36 +85,50 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
             if kind == 'successive' and score > 1.0 and not placed:  # by chance one of six
                 drift = device_drift(forms.parts[part], few)
                 drifts |= {} if drift is None else {part: drift}
-    alike |= {part: ['successive'] for part in drifts}
-    if not alike:
-        return Shared(**correlations, found=(), middles={}, drifting=(), together=1.0)
+    if not (alike or drifts):
+        return Shared(**correlations, found=(), middles={}, drifting={}, together=1.0)
     kernels = {
         part: [(kind, length) for kind in kinds if kind in found for length in DECAYS[kind]]
         for part, found in alike.items()
     }
-    kernels |= dict.fromkeys(drifts, DRIFT_KERNELS)
-    sizes = forms.sizes(kernels) | drifts
-    alike = {part: found for part, found in alike.items() if sizes[part].any()}
+    sizes = forms.sizes(kernels) if alike else {}
+    sizes = {part: sizes[part] for part in alike if sizes[part].any()}
     even = few if stride == 1 else gather(fit.chain, names, system, stride, 1)
-    middles: dict[int, FloatArray] = {}
-    by_kind: dict[str, dict[int, list[tuple[float, float]]]] = {kind: {} for kind in kinds}
-    for part in alike:
-        white, *rest = sizes[part]
-        middles[part] = white * fit.normal.parts[part]
-        for (kind, length), size in zip(kernels[part], rest, strict=True):
-            if size:
-                by_kind[kind].setdefault(part, []).append((length, size))
-    for part, own in by_kind['near'].items():
-        middles[part] += faded_near(even, part, own, stride)
-    successive = faded_in_succession(fit.chain, names, system, by_kind['successive'])
-    for part, middle in successive.items():
-        middles[part] += middle
-    found = tuple(kind for kind in kinds if any(kind in each for each in alike.values()))
+    squared = partial(_products, fit, names, system, even, stride)
+    middles = squared(sizes, kernels)
+    drifting = squared(drifts, dict.fromkeys(drifts, DRIFT_KERNELS))
+    seen = {kind for part in sizes for kind in alike[part]}.union(['successive'] if drifts else ())
+    found = tuple(kind for kind in kinds if kind in seen)
     lengths = [int(samples.observations.stops[-1]) + 1 for samples in system.sets]
     alone = together(few, lengths, drifts[0]) if 0 in drifts else 1.0
-    return Shared(
-        **correlations, found=found, middles=middles, drifting=tuple(drifts), together=alone
-    )
+    return Shared(**correlations, found=found, middles=middles, drifting=drifting, together=alone)
+
+
+def _products(
+    fit: Fit,
+    names: Sequence[str],
+    system: System,
+    even: Stops,
+    stride: int,
+    sizes: Mapping[int, FloatArray],
+    kernels: Mapping[int, Sequence[tuple[str, float]]],
+) -> dict[int, FloatArray]:
+    """Return J^T V J (P, P) by part, with sizes (1 + K,) of independent errors and of kernels.
+
+    Those near in joint space by `even` stops, every `stride`-th.
+    """
+    by_kind: dict[str, dict[int, list[tuple[float, float]]]] = {kind: {} for kind in DECAYS}
+    for part, (_, *own) in sizes.items():
+        for (kind, length), size in zip(kernels[part], own, strict=True):
+            if size:
+                by_kind[kind].setdefault(part, []).append((length, size))
+    found = {part: own[0] * fit.normal.parts[part] for part, own in sizes.items()}
+    for part, near in by_kind['near'].items():
+        found[part] += faded_near(even, part, near, stride)
+    successive = faded_in_succession(fit.chain, names, system, by_kind['successive'])
+    for part, middle in successive.items():
+        found[part] += middle
+    return found
 
 
 def _alike(chain: Chain, names: Sequence[str], extra: FloatArray) -> list[list[int]]:

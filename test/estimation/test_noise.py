@@ -168,7 +168,7 @@ def test_what_neighbours_share_is_finite_though_hardly_anything_tells_a_paramete
     names, system = [*NAMES, 'shoulder_pan_joint.theta'], System((Samples(seen, *NOISE),))
     fit = minimise(UR10E, names[:-1], system)
     fit = replace(fit, normal=normal_equations(fit.chain, names, system))
-    shared = Shared(0.5, 0.0, ('successive',), {0: 4.0 * fit.normal.parts[0]}, (0,), 9.0)
+    shared = Shared(0.5, 0.0, ('successive',), {}, {0: 4.0 * fit.normal.parts[0]}, 9.0)
     monkeypatch.setattr(noise_module, 'shared_errors', lambda *_: shared)
     factor = triangular_factor(fit.chain, names, system)  # with the base's rz it is singular
     noise, uncertainty = noise_of(fit, names, system, factor)
