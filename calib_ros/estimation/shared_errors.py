@@ -19,7 +19,7 @@ where the sizes v_k >= 0 equate the forms r^T K_k r with their expected values (
 which allows for errors absorbed by the fit. The covariance of the parameters is then
 H^-1 (J^T V J) H^-1.
 
-If the device drifts (`drifting.py`), the sizes are those of its errors.
+If the device drifts (`drifting.py`), expected errors of the arm take the sizes from it instead.
 """
 
 from __future__ import annotations
