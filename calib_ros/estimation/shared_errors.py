@@ -97,8 +97,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     squared = partial(_products, fit, names, system, even, stride)
     middles = squared(sizes, kernels)
     drifting = squared(drifts, dict.fromkeys(drifts, DRIFT_KERNELS))
-    seen = {kind for part in sizes for kind in alike[part]}.union(['successive'] if drifts else ())
-    found = tuple(kind for kind in kinds if kind in seen)
+    found = tuple(kind for kind in kinds if any(kind in alike[part] for part in sizes))
     lengths = [int(samples.observations.stops[-1]) + 1 for samples in system.sets]
     alone = together(few, lengths, drifts[0]) if 0 in drifts else 1.0
     return Shared(**correlations, found=found, middles=middles, drifting=drifting, together=alone)
