@@ -17,13 +17,16 @@ have, have the log likelihood
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 from scipy import special
+from scipy.linalg import lapack
 
 from calib_ros.estimation.fading import DECAYS
 from calib_ros.estimation.levels import SEVERAL, UNUSUAL
 from calib_ros.estimation.quadratic_forms import PartRows
+from calib_ros.estimation.samples import gram
 from calib_ros.estimation.stops import Stops
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.values import SAME
@@ -42,14 +45,18 @@ def device_drift(part: PartRows, units: Stops) -> FloatArray | None:
     a drift that lasts longer.
     """
 
+    @cache
+    def one(kind: str, length: float) -> tuple[FloatArray, FloatArray]:
+        return likelihoods(part, units.kernel(kind, length))
+
     def likely(kernels: Sequence[tuple[str, float]]) -> tuple[FloatArray, FloatArray]:
-        pairs = [likelihoods(part, units.kernel(*each)) for each in kernels]
+        pairs = [one(*each) for each in kernels]
         return np.array([each for each, _ in pairs]), np.array([sizes for _, sizes in pairs])
 
     least = float(special.logit(1.0 - UNUSUAL))
-    middle = ((kind, lengths[len(lengths) // 2]) for kind, lengths in DECAYS.items())
-    drift, arm = (float(likely([each])[0].max()) for each in middle)
-    if not drift > max(arm, least):  # few sessions need a closer look
+    drift, arm = ((kind, lengths[len(lengths) // 2]) for kind, lengths in DECAYS.items())
+    highest = one(*drift)[0].max()
+    if not (highest > least and highest > one(*arm)[0].max()):  # few sessions need a closer look
         return None
     (found, sizes), (near, _) = likely(DRIFT_KERNELS), likely(ARM_KERNELS)
     odds, other = (special.logsumexp(each) - np.log(each.size) for each in (found, near))
@@ -78,34 +85,34 @@ def likelihoods(part: PartRows, kernel: FloatArray) -> tuple[FloatArray, FloatAr
     likely v.
     """
     basis, residual, known, shares = part
-    rows = np.concatenate([basis, residual[:, :, np.newaxis]], axis=2)
-    ratios, width = np.geomspace(0.02, 50.0, 12), rows.shape[2]
+    rows = np.concatenate([basis, residual[:, :, np.newaxis]], axis=2).transpose(2, 1, 0)
+    ratios, width = np.geomspace(0.02, 50.0, 12), len(rows)
     products, logs = np.zeros((len(ratios), width, width)), np.zeros(len(ratios))
     for seen in np.unique(known, axis=1).T:
         alike = (known == seen[:, np.newaxis]).all(axis=0)
         values, axes = np.linalg.eigh(kernel * np.outer(seen, seen))
         weights = 1.0 / (1.0 + np.outer(ratios, np.maximum(values, 0.0)))
-        turned = np.tensordot(axes.T, rows[:, alike], 1)
+        turned = np.ascontiguousarray(rows[:, alike]) @ axes
         logs -= alike.sum() * np.log(weights).sum(axis=1)
-        for product, weight in zip(products, weights, strict=True):
-            heavy = weight[:, np.newaxis, np.newaxis] * turned
-            product += heavy.reshape(-1, width).T @ turned.reshape(-1, width)
-    own, along, squares = products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]
+        products += [gram(np.sqrt(weight) * turned) for weight in weights]
     count, others = known.sum(), np.eye(width - 1) - shares
     moved, free = np.einsum('ncp,nc->p', basis, residual), count - np.trace(shares)
     alone = (residual**2).sum() / free
-    size = alone / (1.0 + ratios * np.diag(kernel).mean())
-    for _ in range(1 + SEVERAL):
-        ratio = alone / size
-        matrix = own * ratio[:, np.newaxis, np.newaxis] + others
-        vector = along * ratio[:, np.newaxis] - moved
-        inverse = np.linalg.inv(matrix)
-        shift = np.einsum('rpq,rq->rp', inverse, vector)
-        likely = count * np.log(ratio) - logs - np.linalg.slogdet(matrix)[1] + free
-        likely += (np.einsum('rp,rp->r', shift, vector) - squares * ratio) / alone
-        found = np.array([size, ratios * size])
-        left = squares - 2.0 * np.einsum('rp,rp->r', shift, along)
-        left += np.einsum('rp,rpq,rq->r', shift, own, shift)
-        taken = ratio * np.einsum('rpq,rqp->r', inverse, own)
-        size = left / np.maximum(count - taken, 1.0)
-    return 0.5 * likely, found
+    sizes = alone / (1.0 + ratios * np.diag(kernel).mean())
+    likely = count * np.log(alone) - logs + free
+    for k, (product, squares) in enumerate(zip(products, products[:, -1, -1], strict=True)):
+        own, along = product[:-1, :-1], product[:-1, -1]
+        for left in reversed(range(1 + SEVERAL)):
+            ratio = alone / sizes[k]
+            factor = lapack.dpotrf(own * ratio + others, lower=1)[0]
+            vector = along * ratio - moved
+            shift = lapack.dpotrs(factor, vector, lower=1)[0]
+            if not left:
+                break
+            inverse = lapack.dpotri(factor, lower=1)[0]  # its lower triangle
+            taken = 2.0 * (inverse * own).sum() - np.diag(inverse) @ np.diag(own)
+            squared = squares - 2.0 * shift @ along + shift @ own @ shift
+            sizes[k] = squared / max(count - ratio * taken, 1.0)
+        likely[k] -= count * np.log(sizes[k]) + 2.0 * np.log(np.diag(factor)).sum()
+        likely[k] += shift @ vector / alone - squares / sizes[k]
+    return 0.5 * likely, np.array([sizes, ratios * sizes])
