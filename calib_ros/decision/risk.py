@@ -22,18 +22,14 @@ from scipy import special
 
 from calib_ros.decision.region import Region
 from calib_ros.estimation.gain import inverse_root
-from calib_ros.estimation.joint_errors import (
-    NOTHING,
-    axis_parameters,
-    turns_and_tilts,
-    wobble_columns,
-)
+from calib_ros.estimation.joint_errors import axis_parameters, turns_and_tilts, wobble_columns
 from calib_ros.estimation.levels import ALIKE, KNOWN
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.posterior import MixtureTerm, Posterior
 from calib_ros.estimation.samples import gram
+from calib_ros.kinematics.effects import PLAY
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.parameter import parameters_of
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 
 RISK = 0.02
@@ -59,9 +55,8 @@ def region_of(
     drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
     judge = _Judge(posterior, *ends, freedom)
     joints = np.concatenate([drawn, measured])
-    rows, model = judge.rows(joints), ErrorModel(posterior.chain, posterior.names, *ends)
-    squares, *_ = NOTHING.variances(model, posterior.square, joints, np.s_[:3])
-    sizes = np.sqrt(np.maximum(squares, 0.0))  # of the expected errors
+    rows = judge.rows(joints)
+    sizes = np.sqrt(np.maximum(judge.expected(rows), 0.0))  # of the expected errors
     sizes *= 1.0 + HALF_THE_DIGITS  # as rounded, also in the record
     far, limit = sizes[:SOME_POSES], float(sizes[SOME_POSES:].max())
     order = np.argsort(far)
@@ -109,12 +104,22 @@ class _Judge:
         self._arm = [*arm, *(len(names) + k for k in waves)]
         self._own = [*map(every.index, frames), *arm, *(len(every) + k for k in waves)]
         self._offsets = np.append(posterior.offsets[arm], np.zeros(len(waves)))
+        self._square, driven = posterior.square, {j.name: j.driven for j in chain.joints}
+        self._play = [k for k, name in enumerate(names) if Parameter(name).kind in PLAY]
+        self._sided = [every.index(driven[Parameter(names[k]).owner]) for k in self._play]
 
     def rows(self, joints: FloatArray) -> FloatArray:
         """Return the columns (K, 3, N) of the posterior's names, of others, and of waves."""
         rows = self._model.jacobian(joints)[:, :3].transpose(2, 1, 0)
         _, tilts = turns_and_tilts(self._model.chain, self._model.names, rows)
         return np.concatenate([rows, self._waves * wobble_columns(tilts, joints)])
+
+    def expected(self, rows: FloatArray) -> FloatArray:
+        """Return the expected squares (N,) of position errors by `rows`, play from either side."""
+        own, play = rows[: len(self._square)], np.diag(self._square)[self._play]
+        along = np.tensordot(self._square, own, 1)
+        squares = np.einsum('pcn,pcn->n', along, own)
+        return np.asarray(squares + play @ (rows[self._sided] ** 2).sum(axis=1))
 
     def products(self, rows: FloatArray) -> FloatArray:
         """Return products (K, K) of the columns of frames, then of the arm, from all rows."""
