@@ -261,9 +261,9 @@ class ChangeColumns:
         if carried := tuple(name for name in names if name.kind == load):
             sets.append((LOAD, carried))
         grows = {name: chain.value(name) for name in self._columns if name.is_length}
-        grows |= dict.fromkeys(travels(chain), 1.0)
+        grows |= {name: 1.0 for name in travels(chain) if name in names}  # else it hardly shows
         of_arm = {name: size for name, size in grows.items() if not chain.owns_frame(name)}
-        if scaled and of_arm and grows.keys() <= self._columns.keys():
+        if scaled and of_arm:
             there = any(frame.startswith('base') for frame in frames)  # else both look alike
             for scale, lengths in list(zip(SCALES, (grows, of_arm), strict=True))[: 1 + there]:
                 grown = [size * self._columns[name] for name, size in lengths.items()]

@@ -32,10 +32,14 @@ def joint_of(change):
 
 @pytest.fixture(scope='module')
 def first():
-    true, rng = plants.robot(0)
+    return first_of('ur10e')
+
+
+def first_of(chain):
+    true, rng = plants.robot(0, chain)
     poses = simulation.measure(true, true.random_joints(60, rng), rng, *plants.SIGMAS)
     sigmas = dict(zip(('sigma_position', 'sigma_orientation'), plants.SIGMAS, strict=True))
-    result = identify(Problem(load_chain('ur10e'), poses, **sigmas))
+    result = identify(Problem(load_chain(chain), poses, **sigmas))
     return result_row(result, Filing('A', plants.when(0), '', ''))
 
 
@@ -160,8 +164,10 @@ def test_the_usual_drift_is_no_event_and_hides_none(first, rng):
         assert change.seen <= rows[201].time
 
 
-def test_warmer_nights_are_no_change_and_hide_none(first, rng):
+@pytest.mark.parametrize('arm', ['ur10e', 'ur10e_on_linear_axis'])
+def test_warmer_nights_are_no_change_and_hide_none(arm, rng):
     """By up to some 15 degrees of aluminium; they were bumps of two joints, night after night."""
+    first = first_of(arm)
     names, chain = map(Parameter, first.names), first.corrected()
     grows = np.array([name.is_length and not chain.owns_frame(name) for name in names])
     lengths = [chain.value(n) if yes else 0.0 for n, yes in zip(first.names, grows, strict=True)]
