@@ -21,7 +21,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Model, Objective
-from calib_ros.shown import Shown
+from calib_ros.shown import Shown, counted
 from calib_ros.values import LARGEST
 
 AROUND = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
@@ -75,15 +75,16 @@ def place(
             f'{cells} cells along each axis and {turns} turns are {cells**3 * turns:,} '
             f'placements; the limit is {LARGEST:,.0f}: give fewer'
         )
-    axes = [np.linspace(low, high, cells) for low, high in corners.T]
+    shares = np.linspace(0.0, 1.0, cells) if cells > 1 else np.full(1, 0.5)
+    axes = [low + shares * (high - low) for low, high in corners.T]
     angles = 2.0 * np.pi * np.arange(turns) / turns
     grid = np.stack(np.meshgrid(*axes, angles, indexing='ij'), axis=-1).reshape(-1, 4)
     errors, joints = search.errors(grid, refinements * len(AROUND))
     reached = ~np.isnan(errors)
     if not reached.any():
         raise InputError(
-            f'the arm cannot reach all {len(task)} poses of the task in any of {len(grid)} '
-            'placements: check the unit (m), the orientation and the region, or use more cells'
+            f'the arm cannot reach the whole task in any of {counted(len(grid), "placement")}: '
+            'check the unit (m), the orientation and the region, or use more cells'
         )
     away = np.linalg.norm(grid[:, :3] - grid[reached, :3].mean(axis=0), axis=1)
     centre = int(np.where(reached, away, np.inf).argmin())

@@ -85,14 +85,16 @@ def placed_in_words(placed: Placements) -> str:
     errors = 1e3 * placed.errors
     reached = ~np.isnan(errors)
     moves = np.abs(np.diff(placed.joints[placed.best], axis=0))
+    moved = (
+        f' From pose to pose no joint moves by more than {moves.max(initial=0.0):.2f} rad or m.'
+    )
     where = ', '.join(f'{value:.3f}' for value in placed.positions[placed.best])
     return (
         f'Best at x, y, z = {where} m, {np.degrees(placed.turns[placed.best]):.0f}° about the '
         f'vertical: {rounded(errors[placed.best])} mm; in the centre of the region '
         f'{rounded(errors[placed.centre])} mm, at the worst place '
         f'{rounded(errors[reached].max())} mm. {int(reached.sum())} of {len(reached)} places can '
-        f'be reached. From pose to pose no joint moves by more than {moves.max(initial=0.0):.2f} '
-        'rad or m.'
+        'be reached.' + moved * bool(moves.size)
     )
 
 
