@@ -157,6 +157,8 @@ def in_doubt(header: Sequence[str], plain: Sequence[str], joints: int = 0) -> st
 
     These are coordinates in columns with `plain` names, and the values of joints in q1, q2 ...
     """
+    if {'before_x', 'after_x'} <= {*header}:
+        return 'it holds the errors of a result: give the table that was measured'
     for ours in (plain and POSITION, joint_columns(joints)):
         capitals = [name.upper() for name in ours]
         if ours and {*ours, *capitals} <= {*header}:

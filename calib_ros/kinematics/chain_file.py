@@ -136,8 +136,9 @@ def read_urdf(
 
 
 def chain_text(path: Path) -> str:
-    """Return the text of a chain file."""
-    return texts.read_text(path, what='chain file ')
+    """Return the text of a chain file or a URDF."""
+    what = 'URDF ' if path.suffix.lower() in URDF_SUFFIXES else 'chain file '
+    return texts.read_text(path, what=what)
 
 
 def shipped_robots() -> dict[str, Path]:
