@@ -12,7 +12,7 @@ from scipy import special
 from calib_ros.decision.comparison import COUNTS, Comparison, log_gain, mean_squares
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
-from calib_ros.decision.scale import out_of_scale
+from calib_ros.decision.scale import out_of_scale, stated_length
 from calib_ros.decision.trials import position_fault_limit
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, CONFIDENT
@@ -60,8 +60,8 @@ def gain_refusals(
             f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )
     elif scaled and not result.surprise:
-        printed = all(each.pixels is not None for each in problem.sets)
-        text = out_of_scale(scaled, printed, problem.sigma_scale, result.posterior.strain)
+        length, strain = stated_length(problem), result.posterior.strain
+        text = out_of_scale(scaled, length, problem.sigma_scale, strain)
         yield Reason.with_remedy(Rule.SCALE, result.strain or text)
     elif result.region is not None and result.surprise and before.rms_mm < ALIKE * after.rms_mm:
         yield Reason(

@@ -29,27 +29,34 @@ def scale_reasons(problem: Problem, result: Identification) -> Iterator[Reason]:
         return
     certain = problem.sigma_scale and found.rival and special.expit(found.rival[0]) > CERTAIN
     if region.by_scale >= HARMFUL or certain:
-        text = out_of_scale(found.scale, strain=found.strain)
+        length = stated_length(problem)
+        text = out_of_scale(found.scale, length, strain=found.strain)
         if problem.sigma_scale:
-            again = 'measure a known length, or the printed board, again'
+            again = f'measure {f"the {length}" if length else "a known length"} again'
             text = f'{_grown(found.scale, found.strain)}, more than sigma_scale allows: {again}'
         yield Reason.with_remedy(Rule.SCALE, result.strain or text)
 
 
-def out_of_scale(
-    scale: float, printed: bool = False, stated: float = 0.0, strain: float = 0.0
-) -> str:
+def stated_length(problem: Problem) -> str:
+    """Return the stated length that gives the scale, empty if the device does."""
+    if all(each.pixels is not None for each in problem.sets):
+        return 'size of the board'
+    touched = all(each.socket or each.plane for each in problem.sets)
+    return 'distance of the sockets' * touched
+
+
+def out_of_scale(scale: float, length: str = '', stated: float = 0.0, strain: float = 0.0) -> str:
     """Return that a scale of the device, given minus one, may make the calibrated arm worse.
 
-    Of a `printed` board it is that of its stated size. It may be `stated` to be known to that.
+    It may be that of a stated `length`, and `stated` to be known to that.
     Linear joints imitate a `strain`, by which it differs with the direction.
     """
     grown, size = _grown(scale, strain), 'large' if scale > 0.0 else 'small'
     text = f'{grown}, as if the measuring device were out of scale; then'
-    check, what, usual = 'If a known length shows that its', 'scale of the device', SCALE
-    if printed:
-        check, what, usual = 'Measure the print; if its', 'size of the board', LARGEST_SCALE
-        text = f'{grown}, as if the board were stated too {size}; then'
+    check, what, usual = 'If a known length shows that its scale', 'scale of the device', SCALE
+    if length:
+        check, what, usual = f'Measure the {length}; if it', length, LARGEST_SCALE
+        text = f'{grown}, as if the {length} were stated too {size}; then'
     if abs(scale) < usual or stated:  # as devices have, or arms
         text = f'the {what} is not known well enough:'
     if strain > abs(scale):
@@ -66,7 +73,7 @@ def out_of_scale(
             'right, set sigma_scale (--sigma-scale) to its accuracy, and fit the scale of the '
             'joints (model auto)'
         )
-    return f'{harm}. {check} scale is right, set sigma_scale (--sigma-scale) to its accuracy'
+    return f'{harm}. {check} is right, set sigma_scale (--sigma-scale) to its accuracy'
 
 
 def _grown(scale: float, strain: float) -> str:

@@ -134,10 +134,11 @@ def test_a_checked_board_by_which_the_whole_arm_grows_is_refused(size):
 
 def test_a_board_by_which_hardly_an_arm_grows_is_not_said_to_be_of_another_size():
     """A good SCARA was refused as lengths had shrunk alike, by 0.00049 %."""
-    assert out_of_scale(9e-4, printed=True).startswith('the size of the board is not known')
+    assert out_of_scale(9e-4, 'size of the board').startswith('the size of the board is not known')
     assert out_of_scale(6e-6).startswith('the scale of the device is not known well enough: the')
     assert 'grow alike, by 0.011 %, as if the measuring device' in out_of_scale(1.1e-4)
-    assert 'shrink alike, by 0.11 %, as if' in out_of_scale(-1.1e-3, printed=True)
+    shrunk = out_of_scale(-1.1e-3, 'distance of the sockets')
+    assert 'by 0.11 %, as if the distance of the sockets were stated too small' in shrunk
     assert 'at sigma_scale 0.01 %: measure poses all' in out_of_scale(1.1e-3, stated=1e-4)
 
 
@@ -150,7 +151,7 @@ def test_the_size_of_a_board_is_named_where_it_leaves_no_region(on_flange, size)
     seen = replace(seen, points=seen.points * size)
     (refusal,) = identify(Problem(nominal(on_flange), seen, sigma_pixel=0.1)).refusals
     assert refusal.rule is Rule.SCALE
-    found = re.search(r'(grow|shrink) alike, by (\S+) %, as if the board', refusal)
+    found = re.search(r'(grow|shrink) alike, by (\S+) %, as if the size of the board', refusal)
     assert found
     grown = {'grow': 1.0, 'shrink': -1.0}[found[1]] * float(found[2])
     assert grown == pytest.approx(100.0 * (size - 1.0), abs=0.15)

@@ -99,7 +99,9 @@ def test_a_device_out_of_scale_is_told_where_it_harms_or_was_checked(change, tol
         region=SimpleNamespace(by_scale=given['by_scale']),
         posterior=SimpleNamespace(rival=(given['odds'], (), ()), scale=given['scale'], strain=0.0),
     )
-    found = [*scale_reasons(SimpleNamespace(sigma_scale=given['sigma_scale']), result)]
+    problem = SimpleNamespace(sets=[Observations.from_arrays(*np.zeros((2, 1, 3)))])
+    problem.sigma_scale = given['sigma_scale']
+    found = [*scale_reasons(problem, result)]
     assert told in ' '.join(found)
     assert bool(found) == bool(told)
 
