@@ -147,7 +147,7 @@ or .db3
   --session NAME  only rows with this name in the column session; several joined by commas
 {EYE}
 {LOSS}
-  --sigma-touch M  standard deviation of heights over touched planes; default: 1e-4
+  --sigma-touch M  standard deviation of heights over touched planes [m]; default: 1e-4
 what to write
   --out FOLDER  calibration, result and report
   --force  {FORCE}
@@ -276,8 +276,8 @@ the board
   type charuco|markers  chessboard with markers, or markers alone
   --columns! N  squares or markers across
   --rows! N  squares or markers down
-  --square! M  side of a square, or marker spacing
-  --marker! M  side of a marker
+  --square! M  side of a square, or marker spacing [m]
+  --marker! M  side of a marker [m]
   --dictionary NAME=DICT_5X5_250  marker dictionary of OpenCV
   --out! FILE  PDF to write, with its YAML beside it
   --force  {FORCE}
