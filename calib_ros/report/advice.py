@@ -41,14 +41,14 @@ TOLD_TWICE = {Rule.LAG, Rule.SCALE}
 FAR = 1.0 / EXCEPTION
 """Ratio of residuals to stated noise that an arm's own errors rarely reach."""
 COARSE = (
-    'The remaining error is {:.0f} times the stated device noise: check that target and device '
+    'The remaining error is {:.0f} times the assumed device noise: check that target and device '
     'sit firmly, the arm stood still, the clocks agree, and joint values have all their digits.'
 )
 """First check if the measurements are far too coarse."""
 FEW_POSES = 'Only {} different poses were measured: too few to be sure of anything about the arm.'
 LEFT = (
     'The remaining error corresponds to a device noise of {:.2g} mm in each direction; {:.2g} mm '
-    'is stated (--sigma-position).'
+    'is assumed (--sigma-position).'
 )
 DRIFTS = (
     'Poses measured in succession have similar errors, as if the device drifted: let it warm up '

@@ -99,8 +99,8 @@ def against_noise(poses: Poses) -> Figure:
         x, y = special.ndtri(share), np.quantile(z, share)
         data.append(_curve('markers', name, x, y, marker=marker))
     ends = np.array([-3.0, 3.0])
-    data.append(_curve('lines', 'noise as stated', ends, ends, line=DOTTED))
-    across, up = axis('expected from pure noise'), axis('measured [times the stated noise]')
+    data.append(_curve('lines', 'noise as assumed', ends, ends, line=DOTTED))
+    across, up = axis('expected from pure noise'), axis('measured [times the assumed noise]')
     return {'data': data, 'layout': {'xaxis': across, 'yaxis': up}}
 
 

@@ -64,7 +64,7 @@ def _unwrapped(text: str) -> str:
 
 GOOD_ARM = Advice(
     'There is nothing to correct that this device can see',
-    'The error is within the stated noise of the measuring device: the arm is as good as this '
+    'The error is within the assumed noise of the measuring device: the arm is as good as this '
     'device can see.',
     ('To look for smaller errors, measure with a more accurate device.',),
     sound='Nothing to correct',
@@ -72,7 +72,7 @@ GOOD_ARM = Advice(
 """Instead of `Rule.GAIN`, if the error before is within the noise."""
 GOOD_HERE = Advice(
     'At these poses this device sees nothing to correct',
-    'At these poses the error is within the stated noise of the measuring device. '
+    'At these poses the error is within the assumed noise of the measuring device. '
     'Elsewhere it may be larger: these poses tell little about the rest of the joint range.',
     ('Add poses all over the workspace, each joint moved through most of its range.',),
     sound='Nothing to correct at these poses',

@@ -96,7 +96,7 @@ def identification_report(
             poses,
             (
                 ('Fitted', f'{", ".join(fitted)} to {words.fitted_to(result)}'),
-                ('Stated device noise', f'{_stated(problem, poses)}; one sigma; {scale}'),
+                ('Assumed device noise', f'{_stated(problem, poses)}; one sigma; {scale}'),
                 ('Remaining error', words.times_in_words(result.noise)),
                 ('Judged by', result.validated_by),
             ),
@@ -194,9 +194,10 @@ def _steps(
         f'Measure more poses to decide on the tolerance, {SPREAD_OUT}.': verdict == 'UNDECIDED',
         sentence(bring(result)): True,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
-        'arm: calib_ros verify.': whole,
+        'arm: calib_ros verify; again after a collision or repair.': whole,
         'Then measure at least five new poses near these and judge the corrected arm: calib_ros '
-        'verify. To use it elsewhere, measure there too and identify again.': not whole,
+        'verify; again after a collision or repair. To use it elsewhere, measure there too and '
+        'identify again.': not whole,
     }
     return tuple(step for step, needed in found.items() if needed)
 
@@ -206,9 +207,9 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
     yield section(
         'noise',
         'Remaining errors against device noise',
-        'If only the stated noise of the measuring device remained, all dots would lie on the '
+        'If only the assumed noise of the measuring device remained, all dots would lie on the '
         'dotted line. A steeper line means more error, understated noise, or few poses.',
-        f'Stated in the settings: {_stated(problem, poses)} in each direction; a measurement with '
+        f'Assumed: {_stated(problem, poses)} in each direction; a measurement with '
         'a covariance has its own.',
         figure=figures.against_noise(poses),
         said=(

@@ -254,7 +254,7 @@ def times_in_words(noise: Noise) -> str:
     """Return the ratio of the residuals to the device's noise."""
     shown = [f'{x:,.{2 if x < 100.0 else 0}f}' for x in (noise.position, noise.orientation or 0.0)]
     text = '' if noise.orientation is None else f', {shown[1]} times in orientation'
-    return f'{shown[0]} times the stated device noise{text}'
+    return f'{shown[0]} times the assumed device noise{text}'
 
 
 def scatter_in_words(noise: Noise) -> str:
@@ -263,8 +263,8 @@ def scatter_in_words(noise: Noise) -> str:
     if noise.consistent:
         return f'{text}: consistent with pure noise (chi-squared test).'
     if noise.position < 1.0:
-        return f'{text}: the device is better than stated.'
-    text += ': the device is worse than stated, or the arm has errors that this model lacks.'
+        return f'{text}: the device is better than that.'
+    text += ': the device is worse than that, or the arm has errors that this model lacks.'
     return f'{text} The intervals are widened accordingly.'
 
 
@@ -276,8 +276,9 @@ def unmodelled_in_words(result: Identification) -> str:
     lacking = result.posterior.unmodelled
     seen = lacking.waves * lacking.shown  # else assumed
     across = np.hypot(lacking.tilts, np.sqrt(2.0) * seen)
-    sizes = (1e3 * lacking.turns, 'about their axes'), (1e3 * across, 'across their axes')
-    off = ' and '.join(f'{size:.3f} mrad {way}' for size, way in sizes if round(size, 3))
+    unit = ' or '.join(sorted({f'm{joint.driven.unit}' for joint in result.chain.joints}))
+    sizes = (lacking.turns, unit, 'in their values'), (across, 'mrad', 'across their axes')
+    off = ' and '.join(f'{1e3 * x:.3f} {of} {way}' for x, of, way in sizes if round(1e3 * x, 3))
     come = 'may come' if result.noise.consistent else 'seems to come'
     text = (
         f'Part of the remaining error {come} from the arm and is not in the model, as if joints '

@@ -53,7 +53,7 @@ def test_no_gain_is_told_by_how_much_was_measured_and_what_is_left():
     (few,) = advice.advice(refused, advice.Situation(poses=14, left=2.5, sigma=1e-4))
     assert few.meaning.startswith('Only 14 different poses')
     (enough,) = advice.advice(refused, advice.Situation(poses=50, left=4.62, sigma=1e-4))
-    assert 'noise of 0.46 mm in each direction; 0.1 mm is stated' in enough.meaning
+    assert 'noise of 0.46 mm in each direction; 0.1 mm is assumed' in enough.meaning
 
 
 @pytest.mark.parametrize('rule', [Rule.GAIN, Rule.REGION])

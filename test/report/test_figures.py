@@ -90,7 +90,7 @@ def test_what_joints_do_beyond_the_model_is_told_in_all(solved, shown, across):
     sizes = {'turns': 1e-4, 'tilts': 2e-4, 'waves': 3e-4}
     lacking = result.posterior.unmodelled._replace(**sizes, shown=shown)
     found = replace(result, posterior=replace(result.posterior, unmodelled=lacking))
-    said = f'by 0.100 mrad about their axes and {across} mrad across their axes'
+    said = f'by 0.100 mrad in their values and {across} mrad across their axes'
     assert said in page_of(report_of(problem, found)).text
 
 

@@ -120,10 +120,10 @@ def test_a_noise_that_nobody_stated_is_marked(solved):
     problem = replace(solved[0], sigma_position=5e-5, sigma_orientation=Problem.sigma_orientation)
     identity = dict(report_of(problem, solved[1]).identity)
     stated = '0.05 mm, 0.333 mrad (default); one sigma; scale '
-    assert identity['Stated device noise'] == f'{stated}not checked'
+    assert identity['Assumed device noise'] == f'{stated}not checked'
     problem = replace(problem, sigma_scale=1e-5)
     identity = dict(report_of(problem, solved[1]).identity)
-    assert identity['Stated device noise'] == f'{stated}checked to 10 ppm'
+    assert identity['Assumed device noise'] == f'{stated}checked to 10 ppm'
 
 
 def test_what_others_named_is_text(solved):

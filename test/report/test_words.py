@@ -191,8 +191,8 @@ def test_the_error_told_is_the_one_within_its_limits():
 @pytest.mark.parametrize(
     ('size', 'consistent', 'said'),
     [
-        (1.02, True, 'is 1.02 times the stated device noise: consistent with pure noise'),
-        (0.5, False, 'is 0.50 times the stated device noise: the device is better than stated.'),
+        (1.02, True, 'is 1.02 times the assumed device noise: consistent with pure noise'),
+        (0.5, False, 'is 0.50 times the assumed device noise: the device is better than that.'),
         (1.7, False, 'the arm has errors that this model lacks. The intervals are widened'),
     ],
 )
@@ -219,7 +219,7 @@ def test_far_more_than_noise_is_left_asks_what_was_loose_even_if_accepted(solved
     problem, result = solved
     assert result.accepted
     coarse = replace(result, noise=replace(result.noise, position=9.0 * FAR, shared=()))
-    said = f'{9.0 * FAR:.0f} times the stated device noise: check that target and device sit'
+    said = f'{9.0 * FAR:.0f} times the assumed device noise: check that target and device sit'
     assert said in str(report_of(problem, coarse).remarks)
     assert said not in str(report_of(problem, result).remarks)
     assert report_of(problem, result, warnings=('it is old',)).remarks == ('It is old.',)
@@ -259,7 +259,7 @@ def test_poses_outside_the_region_do_not_lead_to_more_of_them():
             1.4e-5,
             False,
             'seems to come from the arm and is not in the model, as if joints '
-            'were off by 0.020 mrad about their axes and 0.014 mrad across their axes (standard',
+            'were off by 0.020 mrad in their values and 0.014 mrad across their axes (standard',
         ),
         (1e-8, 0.0, False, ''),
     ],
@@ -268,6 +268,7 @@ def test_what_the_model_lacks_is_told_where_there_is_any(turns, tilts, consisten
     lacking = SimpleNamespace(turns=turns, tilts=tilts, waves=1.0, shown=0.0)
     noise = Noise(1.03, None, consistent, 0.3, 0.2, ())
     known = {'posterior': SimpleNamespace(unmodelled=lacking), 'noise': noise}
+    known |= {'chain': load_chain('ur10e')}
     told = words.unmodelled_in_words(SimpleNamespace(**known, surprise=0.0))
     assert bool(told) == bool(said)
     assert said in told
