@@ -7,8 +7,10 @@ from __future__ import annotations
 import ast
 import inspect
 import textwrap
+from collections.abc import Iterator
 from contextlib import suppress
-from itertools import chain, takewhile
+from dataclasses import Field
+from itertools import chain, pairwise, takewhile
 
 
 class WithFields:
@@ -28,11 +30,18 @@ class WithFields:
         return self._text
 
 
-def _fields(of: type) -> list[str]:
-    """Return the lines of the fields of a dataclass, without those that it inherits."""
+def _fields(of: type) -> Iterator[str]:
+    """Yield the lines of the fields of a dataclass, without those that it inherits."""
     lines = inspect.getsource(of).splitlines()
     (found,) = ast.parse(textwrap.dedent('\n'.join(lines))).body
     assert isinstance(found, ast.ClassDef)
     body = list(takewhile(lambda x: isinstance(x, ast.AnnAssign | ast.Expr), found.body))
-    begin, end = (each.end_lineno or 0 for each in (body[0], body[-1]))
-    return lines[begin:end]
+    known: dict[str, Field[object]] = vars(of)['__dataclass_fields__']
+    for before, each in pairwise(body):
+        name = ast.unparse(each.target) if isinstance(each, ast.AnnAssign) else ''
+        yield from lines[before.end_lineno or 0 : each.lineno - 1]
+        if name and 'text' in known[name].metadata:
+            yield f'    {name}: {known[name].type} = {known[name].default!r}'
+            yield f'    """{known[name].metadata["text"]}"""'
+        else:
+            yield from lines[each.lineno - 1 : each.end_lineno]

@@ -23,7 +23,9 @@ def test_help_of_a_value_says_what_its_fields_are():
     assert 'tool: Frame | None = None\n"""T_world_base and T_flange_target; None if' in text
     assert text.endswith('in the base frame, for compliance."""')
     assert 'RMS position error [m] over poses like these' in calib_ros.Verification.__doc__
-    assert 'largest_turn: float' in calib_ros.Compensator.__doc__  # inherited
+    inherited = calib_ros.Compensator.__doc__
+    assert 'largest_turn: float = 0.1\n    """largest correction of' in inherited
+    assert 'default: 1e-6, or 0.02 for arms' in inherited  # not the name of a constant
 
 
 def test_the_import_loads_nothing_else():
