@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures('unsearched')
 
 def test_no_gain_is_claimed_where_there_is_none():
     by_chance = 0
-    for seed in range(12):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         arm = replace(UR10E, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
         seen = measure(arm, UR10E.random_joints(40, rng), rng, 1e-4, 3e-4)
@@ -133,11 +133,9 @@ def test_a_program_that_runs_in_a_loop_is_judged_as_one_lap():
 
 
 def test_what_another_robot_leaves_is_never_accepted():
-    """Seeded arms of another kind with the same number of joints, some of which fit by chance."""
-    other, nominal = load_chain('franka_panda'), load_chain('kuka_iiwa14')
-    for seed in (3, 16):
-        *_, seen = measured_arm(seed, 60, chain=other)
-        assert not identify(Problem(nominal, seen)).accepted
+    """An arm of another kind with the same number of joints, which fits by chance."""
+    *_, seen = measured_arm(16, 60, chain=load_chain('franka_panda'))
+    assert not identify(Problem(load_chain('kuka_iiwa14'), seen)).accepted
 
 
 TOLERANCES = {'*.a': 5e-4, '*.d': 5e-4, '*.alpha': 1e-3, '*.theta': 1e-3, '*.beta': 1e-3}
@@ -178,12 +176,12 @@ def test_few_poses_and_tolerances_are_judged_by_leaving_out_one(oriented, count,
 
 def test_few_poses_and_priors_of_an_arm_without_errors_gain_nothing():
     accepted = 0
-    for seed in range(10):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         true = replace(UR10E, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
         seen = measure(true, UR10E.random_joints(8, rng), rng, 5e-5, 2e-4)
         accepted += identify(Problem(UR10E, seen, priors=TOLERANCES)).accepted
-    assert accepted <= 2  # of 10 by a one-sided test of 95 %
+    assert accepted <= 1  # of 6 by a one-sided test of 95 %
 
 
 def test_a_gross_error_that_the_correction_makes_larger_by_chance_spoils_nothing():
@@ -243,7 +241,7 @@ def test_lengths_that_are_one_multiple_ask_for_the_unit(unsearched):
 def test_an_arm_does_not_make_up_for_a_frame_held_a_little_off(kind):
     """An arm without errors, moved joint by joint; the message says what to do, of it alone."""
     told, chain = 0, load_chain('kuka_iiwa14')
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         true = replace(chain, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
         moves = np.kron(np.eye(7), np.linspace(-1.0, 1.0, 13)[:, np.newaxis])
@@ -257,7 +255,7 @@ def test_an_arm_does_not_make_up_for_a_frame_held_a_little_off(kind):
         assert not result.accepted
         text = f'if the {kind} held by the chain file may be off, remove fixed: true there'
         told += any(text in each for each in result.refusals)
-    assert told >= 3
+    assert told >= 2
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def test_intrinsics_that_are_not_those_of_the_camera_are_refused(on_flange, erro
     near = LENS.moved({'fx': 4.0, 'fy': 4.0, 'cx': 3.0, 'cy': -2.0})
     told = '--lens fitted', 'lens=fitted in sources'
     fitted = replace(off, fixed=False)
-    for lens, of_messages in ((LENS, 0), (near, 0), (near, 1), (off, 1), (fitted, 0)):
+    for lens, of_messages in ((LENS, 0), (near, 0), (off, 1), (fitted, 0)):
         chain, words = nominal(on_flange, lens), told[of_messages]
         result = identify(Problem(chain, seen, sigma_pixel=0.1, of_messages=bool(of_messages)))
         refused, remarked = (

@@ -11,6 +11,8 @@ from calib_ros import Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.delays import other_delay, uneven
 
+pytestmark = pytest.mark.usefixtures('unsearched')
+
 
 def moving(count, delays=0.0, noise=NOISE, errors=1.0):
     """Return poses in motion, joints late by some delays (count, 6) [s], by a clock."""

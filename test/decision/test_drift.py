@@ -54,14 +54,14 @@ def session(seed, errors, kind, count=96, width=0.8, shuffled=False, true=None):
     return replace(seen, positions=seen.positions + drift(kind, len(q), rng))
 
 
-@pytest.mark.parametrize('kind', DRIFTS)
-def test_a_drift_is_no_gain_of_the_arm(kind):
-    """At 95 %: of 4 arms without any error two or more are accepted once in 70 times."""
-    results = [identify(Problem(UR10E, session(seed, 0.0, kind), **SIGMAS)) for seed in range(4)]
+def test_a_drift_is_no_gain_of_the_arm():
+    """At 95 %: of 8 arms without any error two or more are accepted once in 17 times."""
+    seen = (session(seed, 0.0, kind) for kind in DRIFTS for seed in range(2))
+    results = [identify(Problem(UR10E, each, **SIGMAS)) for each in seen]
     assert sum(result.accepted for result in results) <= 1
     # by held-out poses alone most of them would be
     alone = [all(each.rule is Rule.DRIFT for each in result.refusals) for result in results]
-    assert sum(alone) > 1
+    assert sum(alone) > 3
 
 
 def test_an_arm_with_errors_is_accepted_though_the_tracker_drifts():

@@ -62,24 +62,23 @@ def test_neighbours_along_a_path_are_no_repeats(count, rng):
 
 @pytest.mark.parametrize('kind', ['repeats', 'targets', 'test'])
 def test_an_arm_that_bends_is_not_judged_on_what_was_fitted(kind):
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        true = arm(rng, errors=0.0, unmodelled=True)
-        q = UR10E.random_joints(15, rng)
-        if kind == 'repeats':
-            q = rng.permutation(np.repeat(q, 4, axis=0)) + rng.normal(scale=2e-3, size=(60, 6))
-        seen = measure(true, q, rng, *NOISE)
-        more = []
-        for k in range(3 if kind == 'targets' else 0):
-            other = replace(true, tool=random_frame(rng, 0.2))
-            more.append(replace(measure(other, q, rng, *NOISE), tool=f'tool_{k}'))
-        held_out = measure(true, q, rng, *NOISE) if kind == 'test' else None
-        problem = Problem(UR10E, seen, more=more, held_out=held_out, **SIGMAS)
-        for result in (identify(problem), identify_model(problem, 'auto')):
-            if result.accepted:  # as far as it may be used the arm, which does bend, gains by it
-                assert gain(result, true, rng) > 1.0
-            if kind == 'test':
-                assert result.validated_by.endswith('fewer than two held-out poses are new')
+    rng = np.random.default_rng(0)
+    true = arm(rng, errors=0.0, unmodelled=True)
+    q = UR10E.random_joints(15, rng)
+    if kind == 'repeats':
+        q = rng.permutation(np.repeat(q, 4, axis=0)) + rng.normal(scale=2e-3, size=(60, 6))
+    seen = measure(true, q, rng, *NOISE)
+    more = []
+    for k in range(3 if kind == 'targets' else 0):
+        other = replace(true, tool=random_frame(rng, 0.2))
+        more.append(replace(measure(other, q, rng, *NOISE), tool=f'tool_{k}'))
+    held_out = measure(true, q, rng, *NOISE) if kind == 'test' else None
+    problem = Problem(UR10E, seen, more=more, held_out=held_out, **SIGMAS)
+    for result in (identify(problem), identify_model(problem, 'auto')):
+        if result.accepted:  # as far as it may be used the arm, which does bend, gains by it
+            assert gain(result, true, rng) > 1.0
+        if kind == 'test':
+            assert result.validated_by.endswith('fewer than two held-out poses are new')
 
 
 def gain(result, true, rng):

@@ -90,8 +90,9 @@ def test_rows_that_are_not_like_the_others_are_named():
         assert found.corrected < 0.01
 
 
-@pytest.mark.parametrize(('kind', 'count'), [('target', 3), ('target', 2), ('device', 4)])
-@pytest.mark.parametrize('at_each', [True, False])
+@pytest.mark.parametrize(
+    ('kind', 'count', 'at_each'), [('target', 3, True), ('target', 2, False), ('device', 4, True)]
+)
 def test_targets_or_devices_measured_in_turn_without_names_are_named(kind, count, at_each):
     """All at each stop, which is no joint source that stood still, or one at each."""
     arm, rng = load_chain('ur10e'), np.random.default_rng(3)
@@ -120,7 +121,7 @@ def test_targets_in_turn_are_told_from_devices_where_base_and_tool_share_a_freed
     assert str(found).startswith(f'the rows are of 2 {kind}s in turn: name them in a column')
 
 
-def test_targets_one_after_the_other_are_moves_with_each_place():
+def test_targets_one_after_the_other_are_moves_with_each_place(single):
     rng, _, seen = measured_arm(2, 60)
     away = np.concatenate([np.zeros((1, 3)), rng.uniform(-0.1, 0.1, (2, 3))]).repeat(20, axis=0)
     away = np.einsum('nij,nj->ni', seen.rotations, away)
@@ -193,7 +194,7 @@ def test_a_few_rows_in_another_unit_are_named(rows, where, oriented):
 
 
 @pytest.mark.parametrize(('rows', 'oriented'), [(slice(5, 6), False), (slice(5, 12), True)])
-def test_rows_of_a_lost_target_are_gross_errors_only(rows, oriented):
+def test_rows_of_a_lost_target_are_gross_errors_only(rows, oriented, single):
     """Odd and even rows fit alone, but so do all but these: no two arms."""
     *_, seen = measured_arm(1, 60, oriented=oriented)
     positions = seen.positions.copy()

@@ -18,7 +18,6 @@ from calib_ros.estimation.system import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Joint
 from calib_ros.kinematics.se3 import exp_rotation
-from calib_ros.settings import Settings
 
 UR = load_chain('ur10e')
 NOT_OF_ONE_ARM = 'one arm does not fit all sessions'
@@ -302,7 +301,6 @@ def test_most_of_the_fastest_third_is_compared_with_most_of_the_slowest(what):
         (1e-4, True, False),
         (1e-4, False, True),
         (1e-3, True, False),
-        (1e-3, False, False),
         (1e-3, False, True),
     ],
 )
@@ -327,9 +325,6 @@ def test_poses_that_lie_towards_the_stop_before_are_told_and_refused_where_it_ha
     told = [each for each in (*result.refusals, *result.remarks) if 'previous stop' in each]
     most = '[89][0-9]|100' if straight else '9[89]|100'
     assert all(re.search(f'explains ({most}) % of the residuals', each) for each in told)
-    noise = Settings.sigma_position * result.noise.position
-    stated = Problem(UR, seen, sigma_position=noise / 0.9)  # nothing is left to explain
-    assert not any('previous stop' in each for each in identify(stated).remarks)
 
 
 @pytest.mark.parametrize('size', [3e-4, 1e-3])

@@ -302,7 +302,7 @@ def test_parameters_are_within_their_limits_whatever_turns_or_tilts_the_joints(k
 def test_expected_errors_hold_where_a_joint_that_hardly_moved_is_used():
     """The ellipsoids hold 95 % of the positions, also where the prior alone tells the errors."""
     held, ratios = [], []
-    for seed in range(18):
+    for seed in range(9):
         rng = np.random.default_rng(seed)
         q = UR10E.random_joints(20, rng)
         q[:, 1 + seed % 4] = HOME[1 + seed % 4] + rng.uniform(-3e-3, 3e-3, len(q))
@@ -319,7 +319,7 @@ def test_expected_errors_hold_where_a_joint_that_hardly_moved_is_used():
         ratios.append(
             (error**2).sum(axis=1).mean() / (Calibration.of(found).sigma(used) ** 2).mean()
         )
-    assert len(held) > 12
+    assert len(held) > 6
     assert np.mean(held) > 0.9
     assert np.mean(ratios) < 1.25
 

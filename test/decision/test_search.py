@@ -84,12 +84,11 @@ def test_few_poses_and_wires_alone_are_not_searched(count, searched, monkeypatch
     assert bool(tried) == searched
 
 
-@pytest.mark.parametrize('oriented', [False, True])
 @pytest.mark.parametrize(
-    ('lengths', 'angles', 'what'),
+    ('lengths', 'angles', 'oriented', 'what'),
     [
-        (1e3, 1.0, 'the positions are in mm, not metres'),
-        (1.0, np.degrees(1.0), 'the joint values are in degrees, not radians'),
+        (1e3, 1.0, False, 'the positions are in mm, not metres'),
+        (1.0, np.degrees(1.0), True, 'the joint values are in degrees, not radians'),
     ],
 )
 def test_mistakes_beside_sockets_are_those_of_what_is_measured(lengths, angles, what, oriented):

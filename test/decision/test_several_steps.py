@@ -17,6 +17,7 @@ from calib_ros.estimation import fitting
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.documents import as_document
 
+pytestmark = pytest.mark.usefixtures('unsearched')
 COUNT = 60
 BACK = ((30, 0.03), (45, -0.03))
 
