@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -112,22 +113,26 @@ class Recalibration(Shown):
         """
         return self.far and not self.reused and (len(self.changed) > 1 or not self.explained)
 
-    def with_moved(self, frame: str, earlier: Chain, found: Recalibration) -> Recalibration:
-        """Return the result, fitted with a free `frame`, that names this frame as the change.
+    def with_moved(
+        self, frames: Sequence[str], earlier: Chain, found: Recalibration
+    ) -> Recalibration:
+        """Return the result, fitted with free `frames`, that names these as the changes.
 
         `earlier` is the arm before, and `found` has its errors.
         """
         updated = self.calibration
-        own = [k for k, name in enumerate(updated.names) if Parameter(name).owner == frame]
-        names = tuple(Parameter(updated.names[k]) for k in own)
-        change = np.array([updated.chain.offset(name, earlier) for name in names])
-        sigma = np.sqrt(np.diag(np.asarray(updated.covariance))[own])
-        reason = Explanation(frame, names, np.inf, 0.0, 1.0, change, sigma)
-        record = {**updated.record, 'changed': [changes.reason_in_words([reason])]}
+        changed = []
+        for frame in frames:
+            own = [k for k, name in enumerate(updated.names) if Parameter(name).owner == frame]
+            names = tuple(Parameter(updated.names[k]) for k in own)
+            change = np.array([updated.chain.offset(name, earlier) for name in names])
+            sigma = np.sqrt(np.diag(np.asarray(updated.covariance))[own])
+            changed.append((Explanation(frame, names, np.inf, 0.0, 1.0, change, sigma),))
+        record = {**updated.record, 'changed': [*map(changes.reason_in_words, changed)]}
         return replace(
             self,
             calibration=replace(updated, record=record),
-            changed=((reason,),),
+            changed=tuple(changed),
             comparison=replace(self.comparison, before=found.comparison.before),
         )
 

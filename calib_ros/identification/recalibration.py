@@ -15,10 +15,10 @@ few or similar poses let one cause imitate another.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -81,15 +81,10 @@ def recalibrate(
         found, arm = _recalibrated(previous, problem, years, growth, new)
     except (np.linalg.LinAlgError, FloatingPointError) as error:  # some are kilometres off
         raise InputError('the new poses do not fit the arm at all: check their units') from error
-    moved: dict[str, Recalibration] = {}
-    for frame in _movable(arm, problem.all_sets, new) if found.perhaps_moved else ():
-        with suppress(InputError, np.linalg.LinAlgError, FloatingPointError):
-            others, _ = _recalibrated(previous, problem, years, growth, (*new, frame))
-            if others.accepted and not others.changed:
-                moved[frame] = others
-    if len(moved) == 1:  # either of two may have moved
-        ((frame, others),) = moved.items()
-        return others.with_moved(frame, previous.chain, found)
+    movable = _movable(arm, problem.all_sets, new) if found.perhaps_moved else []
+    again = partial(_recalibrated, previous, problem, years, growth)
+    if moved := _moved_far(again, movable, new):
+        return moved[1].with_moved(moved[0], previous.chain, found)
     if found.accepted or found.reused or found.out_of_scale:
         return found
     for number, pose, rest in _without_one(problem, arm):
@@ -109,6 +104,22 @@ def recalibrate(
             raise InputError(f'the new poses do not fit the arm: {mistake}')
         return replace(found, step=previous.step(problem.all_sets))
     return found
+
+
+def _moved_far(
+    again: Callable[..., tuple[Recalibration, Chain]], movable: Sequence[str], new: Sequence[str]
+) -> tuple[Sequence[str], Recalibration] | None:
+    """Return the one movable frame that moved, or all of them, and the result with these new."""
+    for tried in ([(frame,) for frame in movable], [tuple(movable)]):
+        found = []
+        for frames in tried:
+            with suppress(InputError, np.linalg.LinAlgError, FloatingPointError):
+                others, _ = again((*new, *frames))
+                if others.accepted and not others.changed:
+                    found.append((frames, others))
+        if found:  # either of two may have moved
+            return found[0] if len(found) == 1 else None
+    return None
 
 
 def _released(previous: Calibration, new: Sequence[str]) -> Calibration:

@@ -51,3 +51,15 @@ def test_two_positions_in_mm_update_nothing(earlier, without_noise, new, unsearc
 
 def test_a_calibration_simulated_without_noise_is_updated(earlier):
     assert recalibrate(earlier[1], seen(8, (0.0, 0.0)), 0.1).accepted
+
+
+def test_device_and_target_that_both_moved_far_are_named(earlier):
+    """They were refused; another robot there is still."""
+    rng = np.random.default_rng(3)
+    frames = {'base': random_frame(rng, 2.0), 'tool': random_frame(rng, 0.2)}
+    found = recalibrate(earlier[0], seen(12, true=replace(TRUE, **frames), **SIGMAS), 0.1)
+    assert found.accepted
+    assert [reasons[0].owner for reasons in found.changed] == ['base', 'tool']
+    other = replace(faulty(UR10E, Cell(), np.random.default_rng(5)), **frames)
+    with suppress(InputError):
+        assert not recalibrate(earlier[0], seen(12, true=other, **SIGMAS), 0.1).accepted
