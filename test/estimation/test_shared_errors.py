@@ -57,10 +57,9 @@ def hits(true, result, widened=True):
     ]
 
 
-@pytest.mark.parametrize('order', ['path', 'random'])
-def test_independent_errors_stay_independent(order):
+def test_independent_errors_stay_independent():
     """At 99 %: of 20 sessions with nothing shared three are said to share once in 1000 times."""
-    found = [run(seed, 48, order)[1] for seed in range(20)]
+    found = [run(seed, 48, ('path', 'random')[seed % 2])[1] for seed in range(20)]
     assert sum(bool(result.noise.shared) for result in found) <= 2
     # and then standard deviations are those of the Cramer-Rao bound, by the noise given or found
     quiet = [result for result in found if not result.noise.shared and result.noise.consistent]
@@ -70,8 +69,8 @@ def test_independent_errors_stay_independent(order):
 
 
 def test_intervals_hold_the_truth_though_the_tracker_drifts():
-    """20 sessions of 30 parameters: their coverage spreads by 0.06 a session, 0.013 in all."""
-    runs = [run(seed, drift=10.0) for seed in range(20)]
+    """12 sessions of 30 parameters: their coverage spreads by 0.06 a session, 0.017 in all."""
+    runs = [run(seed, drift=10.0) for seed in range(12)]
     assert all('successive' in result.noise.shared for _, result in runs)
     covered = np.mean([hits(*each) for each in runs])
     alone = np.mean([hits(*each, widened=False) for each in runs])

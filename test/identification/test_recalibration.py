@@ -98,9 +98,9 @@ def test_what_was_held_nominal_may_be_told_by_new_poses(seed):
 
 
 def test_of_an_arm_that_has_not_changed_nothing_is_claimed(earlier):
-    """Of 8 sets of 8 poses at 0.5 % each, one claim is improbable (4 %); seeded."""
+    """Of 5 sets of 8 poses at 0.5 % each, one claim is improbable (2.5 %); seeded."""
     true, previous = earlier
-    found = [recalibrate(previous, problem(true, 8, seed), 0.1) for seed in range(8)]
+    found = [recalibrate(previous, problem(true, 8, seed), 0.1) for seed in range(5)]
     assert not any(each.changed for each in found)
     assert all(each.accepted for each in found)
     assert np.mean([rms(each.calibration.chain, true, Q) for each in found]) < 1.1 * rms(

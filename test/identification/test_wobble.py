@@ -196,7 +196,7 @@ def test_beyond_the_sigma_what_looks_like_noise_is_slides_of_three_linear_axes(s
 def test_few_positions_that_do_not_tell_turns_of_joints_from_noise_do_not_rule_them_out():
     """What exceeds the stated sigma is the arm's then, and expected errors contain it."""
     chain, turns, squares = load_chain('denso_hsr065'), [1.5e-4, 1.5e-4, 5e-5, 1.5e-4], []
-    for seed in range(10):
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         true, q, new = faulty(chain, Cell(), rng), *np.split(chain.random_joints(220, rng), [20])
         moved, elsewhere = (each + rng.normal(scale=turns, size=each.shape) for each in (q, new))
@@ -210,7 +210,7 @@ def test_few_positions_that_do_not_tell_turns_of_joints_from_noise_do_not_rule_t
 
 def test_few_poses_of_a_sound_arm_are_not_expected_to_be_twice_as_bad():
     squares = []
-    for seed in range(10):
+    for seed in range(5):
         arm = Wobbling(seed)
         arm.sizes *= 0.0
         result = identify(arm.measured(np.zeros(6), 8, 3.1))
