@@ -210,7 +210,7 @@ def travel(q, order, speeds):
     return (np.abs(np.diff(q[list(order)], axis=0)) / speeds).max(axis=1).sum()
 
 
-@pytest.mark.parametrize(('count', 'seed'), [(1, 0), (2, 0), *((7, seed) for seed in range(8))])
+@pytest.mark.parametrize(('count', 'seed'), [(1, 0), (2, 0), *((7, seed) for seed in range(3))])
 def test_the_way_is_close_to_the_shortest(count, seed):
     rng = np.random.default_rng(seed)
     q, speeds = rng.uniform(-3.0, 3.0, (count, 3)), np.array([1.0, 2.0, 0.5])

@@ -130,27 +130,6 @@ def folder(arm, tmp_path):
     return 'result'
 
 
-def test_workspace_writes_tables_words_and_figures(run, folder, tmp_path):
-    arguments = (folder, '--chain', 'ur10e', '--out', 'map', '--poses', 500)
-    status, out, err = run('workspace', *arguments)
-    assert (status, err) == (0, '')
-    found = {path.name for path in (tmp_path / 'map').iterdir()}
-    assert found == set(WORKSPACE_FILES)
-    text = (tmp_path / 'map' / 'workspace.md').read_text()
-    assert text.startswith('# Errors over the workspace: ur10e 4711')
-    assert 'Where the calibration removes most' in text
-    assert text.count('| expected to remain |') == 1
-    assert 'Expected to remain: its uncertainty' in text
-    with (tmp_path / 'map' / 'workspace.csv').open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 500
-    assert rows[0].keys() == {'x', 'y', 'z', 'error', 'sigma'}
-    rms = 1e3 * np.sqrt(np.mean([float(row['error']) ** 2 for row in rows]))
-    assert f'| removed by the calibration | {rms:.3f} |' in text
-    assert f'{rms:.3f}' in out
-    assert run('workspace', *arguments)[0] == 1
-
-
 def test_the_poses_of_a_task_may_have_units(tmp_path):
     """They were asked for in the header, and refused there."""
     path = tmp_path / 'task.csv'
@@ -165,7 +144,7 @@ def test_the_poses_of_a_task_may_have_units(tmp_path):
             read_poses(path)
 
 
-def test_workspace_places_a_task(run, folder, tmp_path):
+def test_workspace_writes_tables_words_and_figures_and_places_a_task(run, folder, tmp_path):
     task = TASK[::2]
     values = np.column_stack([task[:, :3, 3], to_quat(task[:, :3, :3])])
     (tmp_path / 'task.csv').write_text(csv_of(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), values))
@@ -173,14 +152,28 @@ def test_workspace_places_a_task(run, folder, tmp_path):
     (tmp_path / 'long.csv').write_text('x,y,z,qx,qy,qz,qw\n1,2,3,1,0,0,1\n')
     with pytest.raises(InputError, match='line 2: quaternion'):
         read_poses(tmp_path / 'long.csv')
-    status, out, err = run(
-        'workspace',
-        *(folder, '--chain', 'ur10e', '--out', 'map', '--poses', 500, '--task', 'task.csv'),
-        *('--model', 'nominal', '--aim', 'worst', '--cells', 4, '--region', 0, -1, -0.5, 1, 1, 1),
+    given = (
+        *('workspace', folder, '--chain', 'ur10e', '--out', 'map', '--poses', 500),
+        *('--task', 'task.csv', '--model', 'nominal', '--aim', 'worst', '--cells', 3),
+        *('--region', 0, -1, -0.5, 1, 1, 1),
     )
+    status, out, err = run(*given)
     assert (status, err) == (0, '')
     files = {path.name for path in (tmp_path / 'map').iterdir()}
     assert files == {*WORKSPACE_FILES, *PLACEMENT_FILES}
+    text = (tmp_path / 'map' / 'workspace.md').read_text()
+    assert text.startswith('# Errors over the workspace: ur10e 4711')
+    assert 'Where the calibration removes most' in text
+    assert text.count('| expected to remain |') == 1
+    assert 'Expected to remain: its uncertainty' in text
+    with (tmp_path / 'map' / 'workspace.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 500
+    assert rows[0].keys() == {'x', 'y', 'z', 'error', 'sigma'}
+    rms = 1e3 * np.sqrt(np.mean([float(row['error']) ** 2 for row in rows]))
+    assert f'| removed by the calibration | {rms:.3f} |' in text
+    assert f'{rms:.3f}' in out
+    assert run(*given)[0] == 1
     joints = read_joints(tmp_path / 'map' / 'placed_task.csv', UR)
     with (tmp_path / 'map' / 'placements.csv').open() as file:
         rows = list(csv.DictReader(file))
