@@ -4,6 +4,7 @@ import errno
 import hashlib
 import json
 import os
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -30,12 +31,20 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture
-def calibrated(folder):
-    """Return the folder of a robot of which the first of two nights is identified and filed."""
+@pytest.fixture(scope='module')
+def identified(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('identified')
     plants.write_plant(folder, ['0042'], 2)
-    assert main(['identify', 'nights/0042/000.csv', *COMMON, '--out', 'result']) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main(['identify', 'nights/0042/000.csv', *COMMON, '--out', 'result']) == 0
     return folder
+
+
+@pytest.fixture
+def calibrated(folder, identified):
+    """Return the folder of a robot of which the first of two nights is identified and filed."""
+    return shutil.copytree(identified, folder, dirs_exist_ok=True)
 
 
 def piped(text):
@@ -198,9 +207,9 @@ def test_an_impatient_operator_ends_a_fleet_in_good_order(folder, monkeypatch, c
 
 
 def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
-    bump = {'B': (3, {'elbow_joint.theta': 2e-4})}
-    plants.write_plant(folder, ['A', 'B', '<C>'], 4, 40, bump)
-    bad = folder / 'nights/<C>/003.csv'
+    bump = {'B': (2, {'elbow_joint.theta': 2e-4})}
+    plants.write_plant(folder, ['A', 'B', '<C>'], 3, 40, bump)
+    bad = folder / 'nights/<C>/002.csv'
     bad.write_text(bad.read_text()[:300])
     command = ['fleet', 'plant.yaml', '--history', 'history', '--out', 'report']
     with LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=None) as local:
@@ -208,14 +217,14 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
         assert main(command) == Status.NOT_ACCEPTED
     said = capsys.readouterr()
     assert '1 changed, 1 unreadable, 1 fine' in said.out
-    assert 'B, 2025-10-12: changed: elbow_joint.theta by +0.' in said.out
+    assert 'B, 2025-10-11: changed: elbow_joint.theta by +0.' in said.out
     assert '<C>: ' in said.err
-    assert '003.csv' in said.err
+    assert '002.csv' in said.err
 
     text = (folder / 'calib.prom').read_text()
     assert 'calib_ros_fleet_robots{state="changed"} 1\n' in text
     assert 'calib_ros_fleet_unreadable_inputs 1\n' in text
-    when = plants.FIRST + 3 * plants.DAY + 39
+    when = plants.FIRST + 2 * plants.DAY + 39
     assert f'calib_ros_robot_changed_timestamp_seconds{{serial="B"}} {when}\n' in text
     page = (folder / 'report/index.html').read_text()
     assert '&lt;C&gt;' in page
@@ -226,7 +235,7 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
     assert f'<td class="robot">{link}</td>' in page
     robots = (folder / f'report/robots/%3CC%3E/{own.key}.html').read_text()
     assert 'within the tolerance of 0.3\xa0mm RMS' in robots
-    assert len(pandas.read_parquet('history')) == 11
+    assert len(pandas.read_parquet('history')) == 8
 
     plant = json.loads((folder / 'plant.yaml').read_text())
     plant['groups']['line']['tolerance'] = 0.01
@@ -235,7 +244,7 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
     bad.unlink()
     assert main(quiet) == Status.NOT_ACCEPTED
     said = capsys.readouterr().out
-    assert said.startswith('- B, 2025-10-12: changed: elbow_joint.theta by +0.')
+    assert said.startswith('- B, 2025-10-11: changed: elbow_joint.theta by +0.')
     assert said.count('- B, ') == 2
     for serial in ('A', 'B', '<C>'):
         assert f'- {serial}, beyond tolerance: 0.' in said
@@ -247,7 +256,7 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
     assert 'none/calib.prom: No such file or directory' in told.err
 
     plant['groups']['line']['tolerance'] = 0.3
-    plant['robots'][1]['since'] = '2025-10-12'
+    plant['robots'][1]['since'] = '2025-10-11'
     (folder / 'plant.yaml').write_text(json.dumps(plant))
     command = quiet[:-1]
     assert main(command) == 0

@@ -77,7 +77,7 @@ def cell(tmp_path_factory):
             ('identify', 'bumped.csv', *UR5E, '--out', 'bumped'),
             ('board', 'charuco', *BOARD, '--out', 'board.pdf'),
             ('simulate', 'bag', *UR5E, '--poses', '8'),
-            ('plan', *UR5E, '--iso9283', '--out', 'tests.csv'),
+            ('plan', *UR5E, '--poses', '5', '--draw', '60', '--out', 'tests.csv'),
         ):
             assert main([*given, '--quiet']) == 0
     return folder
