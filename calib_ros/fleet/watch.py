@@ -20,7 +20,8 @@ waves. They are the same in all nights: in the same region they change nothing.
 An effect that only some nights fitted is nominal in the others too: with the information matrix I
 of all parameters of the arm, a fit of the common ones c alone has I_cc and (I x)_c. That does not
 hold for DH parameters, which are far from nominal. Neither warmth nor model error suddenly makes
-nights scatter CLEARLY more: if every joint and pair leaves more, several changed.
+nights scatter CLEARLY more: if every joint and pair leaves more, several changed. Zeros of SEVERAL
+joints, or of all, are told instead if likelier (`several.py`).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from itertools import combinations
 from typing import Any, NamedTuple, TypeAlias
@@ -42,9 +43,12 @@ from calib_ros.decision.changes import (
     ChangeColumns,
     Explanation,
     Information,
+    changes_in_words,
+    explanation_of,
     reason_in_words,
     reasons_of,
 )
+from calib_ros.decision.several import Changes, likelier
 from calib_ros.estimation.levels import CLEARLY, KNOWN, LARGEST_SCALE, SEVERAL, TELLING, chance_of
 from calib_ros.files.rows import Row
 from calib_ros.identification.age import YEAR, drift_of
@@ -63,13 +67,16 @@ class Change:
 
     time: datetime  # of the first night after it
     seen: datetime  # of the night of its detection
-    reasons: tuple[Explanation, ...]  # most likely first; none if two or more joints changed
+    reasons: tuple[Explanation, ...] = ()  # most likely first; none if two or more joints changed
     pair: tuple[str, ...] = ()  # the joints if two changed
+    zeros: Changes = field(default_factory=list)  # of SEVERAL joints or more
 
     def __str__(self) -> str:
         asked = 'was it bumped' + ', or does it creep' * (self.seen > self.time) + '?'
         if self.pair:
             return f'two joints changed: {" and ".join(self.pair)}: {asked}'
+        if self.zeros:
+            return f'{changes_in_words(self.zeros)}: was it mastered again, or bumped?'
         if not self.reasons:
             return (
                 'several joints changed: was the robot repaired, or are these the measurements of '
@@ -184,9 +191,9 @@ def _compare_nights(fitted: Sequence[_Fitted], years: float) -> Watched:
             continue
         k = fresh + int(alarms[0])
         row = rows[first + k]
-        lag, reasons, pair = _cause(tests, k, level, row)
+        lag, reasons, pair, zeros = _cause(tests, k, level, row)
         first, known_up_to = first + k + 1 - LAGS[lag], first + k + 1
-        changes.append(Change(rows[first].time, row.time, reasons, pair))
+        changes.append(Change(rows[first].time, row.time, reasons, pair, zeros))
     nights = tuple(Night(row, each) for row, each in zip(rows, strengths, strict=True))
     newest = set(arms[-1])
     left = sorted(newest.union(*arms[first:]) - newest.intersection(*arms[first:]))
@@ -197,19 +204,35 @@ def _compare_nights(fitted: Sequence[_Fitted], years: float) -> Watched:
 
 def _cause(
     tests: _Tests, k: int, level: float, row: Row
-) -> tuple[int, tuple[Explanation, ...], tuple[str, ...]]:
-    """Return the lag of an alarm in night k, and the one joint or the pair that changed, if so."""
-    if tests.several[:, k].min() < level:
-        return int(tests.several[:, k].argmin()), (), ()
-    lag = int(tests.chances[:, k].min(axis=1).argmin())
+) -> tuple[int, tuple[Explanation, ...], tuple[str, ...], Changes]:
+    """Return the lag of an alarm in night k, and the joint, the pair or the zeros that changed.
+
+    None of these if others did.
+    """
+    several = bool(tests.several[:, k].min() < level)
+    shown = tests.several[:, k] if several else tests.chances[:, k].min(axis=1)
+    lag, pair = int(shown.argmin()), tuple[str, ...]()
     one, two = np.split(tests.chances[lag, k], [len(tests.joints)])
-    if two.min(initial=1.0) < level:
+    if not several and two.min(initial=1.0) < level:
         first, pair = tests.groups[int(one.argmin())], tests.groups[len(one) + int(two.argmin())]
-        if one.min() >= level or _more_by_chance(tests, lag, k, first, pair) < level:
-            return lag, (), pair
-    columns = ChangeColumns(row.corrected(), tests.names)
+        if one.min() < level and _more_by_chance(tests, lag, k, first, pair) >= level:
+            pair = ()
+    columns, freedom = ChangeColumns(row.corrected(), tests.names), float(tests.freedom[k])
     information = Information(tests.names, tests.weight[lag, k], tests.pull[lag, k])
-    return lag, reasons_of(information, columns, float(tests.freedom[k]), most=1.0), ()
+    reasons = reasons_of(information, columns, freedom, most=1.0)
+    parts = ((joint, tuple(n for n in tests.names if n.owner == joint)) for joint in pair)
+    given: Changes = [(explanation_of(information, columns, freedom, *part),) for part in parts]
+    zeros = likelier(information, columns, freedom, given or [reasons])
+    names = [name for each in zeros for name in each[0].names]
+    if len(names) >= SEVERAL and all(name in columns.zeros for name in names):
+        others = len(tests.names) - len(names)
+        gain, whole = (
+            information.explained(each)[0]
+            for each in (columns.of(names), np.eye(others + len(names)))
+        )
+        if special.fdtrc(others, freedom, (whole - gain) / (CLEARLY**2 * others)) >= level:
+            return lag, (), (), zeros
+    return lag, () if several or pair else reasons, pair, []
 
 
 def _more_by_chance(

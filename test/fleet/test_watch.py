@@ -325,3 +325,15 @@ def test_no_alarm_goes_away_when_a_later_night_has_another_model(first, rng):
     rows[11] = without(rows[11], *EFFECTS)
     (again,) = watch(rows, 100.0).changes
     assert again.seen == change.seen == rows[5].time
+
+
+def test_a_robot_that_was_mastered_again_is_none_of_two_bumped_joints(first, rng):
+    """All zeros moved: the two that moved most were named, or a bent link."""
+    driven = [name for name in first.names if name.endswith('joint.theta')]
+    for size in (20.0, 400.0):
+        sigma = size * np.sqrt(np.diag(first.covariance)) * np.isin(first.names, driven)
+        moved = sigma * rng.choice([-1.0, 1.5], len(sigma))
+        rows = list(nights(first, rng, 8))
+        rows = [replace(r, offsets=r.offsets + moved * (k >= 4)) for k, r in enumerate(rows)]
+        (change,) = watch(rows, 100.0).changes
+        assert str(change) == 'changed: all joints (theta): was it mastered again, or bumped?'
