@@ -4,12 +4,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.settings import Settings
 from calib_ros.shown import are_lines, moment, rows_in_words
 
 ZERO = 'zero'  # of the distances of a device
@@ -80,8 +82,11 @@ class Step:
 
     @property
     def _size(self) -> str:
-        """Return the size in words; only of several with its sign."""
-        size = self.size if self.later else abs(self.size)
+        """Return the size in words; only of several with its sign; large angles in degrees."""
+        size = math.remainder(self.size, 2.0 * math.pi) if self.unit == 'rad' else self.size
+        size = size if self.later else abs(size)
+        if self.unit == 'rad' and abs(size) > Settings.largest_angle:
+            return f'by {math.degrees(size):.0f}°'
         return f'by {float(f"{1e3 * size:.2g}"):g} m{self.unit}'
 
     @property

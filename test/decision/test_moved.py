@@ -116,6 +116,11 @@ ZERO = replace(FRAME, owners=('wire',), kind='zero', thing='the device', longer=
             f'the zero of elbow_joint moved by 1.2 mrad before pose 7{AGAIN}',
         ),
         (
+            replace(JOINT, size=4.712),
+            'the zero of elbow_joint moved by 90° before row 5',
+            f'the zero of elbow_joint moved by 90° before pose 7{AGAIN}',
+        ),
+        (
             replace(LOAD, later=LATER[:1]),
             'the load of the arm changed before row 5, before line 9: poses differ by 1.2 mm; '
             'measure with one load, or fit only the poses before or only those after',
