@@ -100,13 +100,16 @@ def unsteady(problem: Problem, result: Identification) -> tuple[str, bool]:
     rounding = np.sqrt(sum(step**2 for step in steps) / 12.0 / len(problem.chain.joints))
     if not (lacking.random and lacking.turns > max(typical, ALIKE * rounding)):
         return '', False
+    if result.refusals and lacking.turns > problem.largest_angle:  # something else is wrong
+        return '', False
     before, after = result.comparison.figures
     slight = before.rms_mm < ALIKE * after.rms_mm and lacking.turns > typical / NEARER
     unit = ' or '.join(sorted({f'm{joint.driven.unit}' for joint in problem.chain.joints}))
     text = (
         f'joints seem off by {1e3 * lacking.turns:.2g} {unit} at random, from pose to pose: the '
         'arm moved while it was measured, joint values and poses are not of one moment, values '
-        'lack digits, or joints have play. Stop at each pose, and compare the clocks'
+        'lack digits, joints have play, or devices or targets lack names. Stop at each pose, '
+        'and compare the clocks'
     )
     return text, bool(result.refusals) or slight
 
