@@ -36,7 +36,7 @@ NEEDED = 1 + len(TILTED)  # configurations without those for fitted frames: as i
 def verify(
     arm: Calibration,
     sets: Sequence[Observations],
-    tolerance: InMetres | None,
+    tolerance: InMetres | None = None,
     confidence: Confidence = CONFIDENT,
     new_base: bool = False,
     commanded: FloatArray | None = None,
