@@ -11,6 +11,7 @@ from __future__ import annotations
 import html
 import logging
 import re
+from functools import cache
 from importlib import resources
 from typing import Any
 
@@ -82,16 +83,21 @@ def filled(template: str, **values: Any) -> str | None:
         import jinja2
     except ImportError:
         return None
+    values |= {'marks': MARKS, 'css': _template('report.css'), 'js': _template('report.js')}
+    page: str = _environment(jinja2).get_template(template).render(**values)
+    return page
+
+
+@cache  # pages of a fleet compile their template once
+def _environment(jinja2: Any) -> Any:
     loader, undefined = jinja2.FunctionLoader(_template), jinja2.StrictUndefined
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=undefined, finalize=_shown, trim_blocks=True
     )
-    values |= {'marks': MARKS, 'css': _template('report.css'), 'js': _template('report.js')}
     safe = environment.filters['safe']
     environment.filters['rounded'] = rounded
     environment.filters['typed'] = lambda text: safe(with_code(text))
-    page: str = environment.get_template(template).render(**values)
-    return page
+    return environment
 
 
 def _template(name: str) -> str:
