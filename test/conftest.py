@@ -63,6 +63,18 @@ def run(capsys, tmp_path, monkeypatch):
     return run
 
 
+@pytest.fixture
+def drawn():
+    """Let pictures be drawn."""
+
+
+@pytest.fixture(autouse=True)
+def undrawn(request, monkeypatch):
+    """Let the other tests leave PNG files empty: to draw one takes longer than to identify."""
+    if 'drawn' not in request.fixturenames:
+        monkeypatch.setattr('calib_ros.report.plots.png_of', lambda figure: b'')
+
+
 @pytest.fixture(autouse=True)
 def no_signs_of_life(monkeypatch):
     """Keep lines that tell how long a command takes, on a busy machine, from its output."""

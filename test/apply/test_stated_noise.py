@@ -52,7 +52,7 @@ def test_a_device_with_more_noise_does_not_condemn_the_arm(cell, arm):
 def test_a_stated_noise_may_have_the_value_of_the_default(cell, arm):
     """It was taken for that of the earlier device, here a better one."""
     noise, names = (Settings.sigma_position, 4e-4), ('sigma_position', 'sigma_orientation')
-    seen = measured(cell[0], UR.random_joints(60, np.random.default_rng(3)), 1, noise)
+    seen = measured(cell[0], UR.random_joints(40, np.random.default_rng(3)), 1, noise)
     was = replace(
         arm.noise, position=1.0, orientation=1.0, given=dict(zip(names, NOISE, strict=True))
     )

@@ -144,6 +144,7 @@ def test_the_poses_of_a_task_may_have_units(tmp_path):
             read_poses(path)
 
 
+@pytest.mark.usefixtures('drawn')
 def test_workspace_writes_tables_words_and_figures_and_places_a_task(run, folder, tmp_path):
     task = TASK[::2]
     values = np.column_stack([task[:, :3, 3], to_quat(task[:, :3, :3])])
@@ -161,6 +162,8 @@ def test_workspace_writes_tables_words_and_figures_and_places_a_task(run, folder
     assert (status, err) == (0, '')
     files = {path.name for path in (tmp_path / 'map').iterdir()}
     assert files == {*WORKSPACE_FILES, *PLACEMENT_FILES}
+    for name in ('workspace.png', 'placements.png'):
+        assert (tmp_path / 'map' / name).read_bytes().startswith(b'\x89PNG')
     text = (tmp_path / 'map' / 'workspace.md').read_text()
     assert text.startswith('# Errors over the workspace: ur10e 4711')
     assert 'Where the calibration removes most' in text

@@ -195,6 +195,7 @@ def test_a_simulated_arm_has_the_backlash_of_its_chain(run, tmp_path):
         assert re.search(size, report)
 
 
+@pytest.mark.usefixtures('drawn')
 def test_demo_shows_the_whole_way(run, tmp_path):
     status, out, err = run('demo', '--poses', 20, '--out', tmp_path / 'demo')
     assert (status, err) == (0, '')
@@ -202,6 +203,7 @@ def test_demo_shows_the_whole_way(run, tmp_path):
     assert 'elbow_joint.theta' in out
     there = {path.name for path in (tmp_path / 'demo').iterdir()}
     assert there == {*RESULT_FILES, 'bag', 'bag_truth.yaml'}
+    assert (tmp_path / 'demo' / 'before_after.png').read_bytes().startswith(b'\x89PNG')
     status, _, err = run('demo', '--poses', 20, '--out', tmp_path / 'demo')
     assert status == 1
     assert '--force' in err

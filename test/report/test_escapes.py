@@ -111,6 +111,7 @@ def test_a_report_is_of_one_form_whatever_the_names(result, monkeypatch):
         assert plain.count('|') == usual[row].count('|'), name
 
 
+@pytest.mark.usefixtures('drawn')
 @pytest.mark.parametrize('name', ['$x^{$', '\\', '<script>'])
 def test_a_figure_is_drawn_whatever_the_name(result, name):
     renamed = replace(result, chain=replace(result.chain, name=name))
