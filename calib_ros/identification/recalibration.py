@@ -110,7 +110,7 @@ def _moved_far(
     again: Callable[..., tuple[Recalibration, Chain]], movable: Sequence[str], new: Sequence[str]
 ) -> tuple[Sequence[str], Recalibration] | None:
     """Return the one movable frame that moved, or all of them, and the result with these new."""
-    for tried in ([(frame,) for frame in movable], [tuple(movable)]):
+    for tried in ([(frame,) for frame in movable], [tuple(movable)] * (len(movable) > 1)):
         found = []
         for frames in tried:
             with suppress(InputError, np.linalg.LinAlgError, FloatingPointError):
