@@ -61,11 +61,12 @@ def _factor(matrix: FloatArray, precision: FloatArray) -> FloatArray:
 
     Rounding does not depend on the scale of the columns.
     """
-    posterior, size = matrix.copy(), np.arange(len(matrix))
-    diagonal = matrix[size, size] + precision
-    posterior[size, size] = diagonal + ROUNDING * np.maximum(diagonal, 1e-300)  # never singular
+    posterior = matrix.copy()
+    diagonal = posterior.reshape(-1)[:: len(matrix) + 1]  # a view
+    diagonal += precision
+    diagonal += ROUNDING * np.maximum(diagonal, 1e-300)  # never singular
     factor, failed = lapack.dpotrf(posterior.T, lower=1, overwrite_a=1)
-    if failed or not np.isfinite(diagonal).all():
+    if failed or not np.isfinite(diagonal.sum()):
         raise np.linalg.LinAlgError('singular posterior')
     return np.asarray(factor)
 
