@@ -39,6 +39,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import special
 
 from calib_ros.decision.changes import (
+    LOAD,
     SCALES,
     ChangeColumns,
     Explanation,
@@ -70,9 +71,13 @@ class Change:
     reasons: tuple[Explanation, ...] = ()  # most likely first; none if two or more joints changed
     pair: tuple[str, ...] = ()  # the joints if two changed
     zeros: Changes = field(default_factory=list)  # of SEVERAL joints or more
+    loaded: bool = False  # its night fitted gravity and no earlier one, or the other way round
 
     def __str__(self) -> str:
-        asked = 'was it bumped' + ', or does it creep' * (self.seen > self.time) + '?'
+        if self.reasons and self.reasons[0].owner == LOAD:
+            return f'{reason_in_words(self.reasons)}: does it carry another one?'
+        asked = 'was it bumped' + ', or does it creep' * (self.seen > self.time)
+        asked += ', or does it carry another load' * self.loaded + '?'
         if self.pair:
             return f'two joints changed: {" and ".join(self.pair)}: {asked}'
         if self.zeros:
@@ -169,6 +174,7 @@ def _other(names: frozenset[Parameter], newest: frozenset[Parameter]) -> str:
 
 def _compare_nights(fitted: Sequence[_Fitted], years: float) -> Watched:
     rows, arms = [row for row, _ in fitted], [arm for _, arm in fitted]
+    bent = [any('.gravity_' in name for name in arm) for arm in arms]
     strengths: list[dict[str, float]] = [{} for _ in rows]
     changes: list[Change] = []
     first = known_up_to = 0
@@ -192,8 +198,9 @@ def _compare_nights(fitted: Sequence[_Fitted], years: float) -> Watched:
         k = fresh + int(alarms[0])
         row = rows[first + k]
         lag, reasons, pair, zeros = _cause(tests, k, level, row)
-        first, known_up_to = first + k + 1 - LAGS[lag], first + k + 1
-        changes.append(Change(rows[first].time, row.time, reasons, pair, zeros))
+        before, known_up_to = bent[first : first + k + 1 - LAGS[lag]], first + k + 1
+        first, loaded = first + len(before), bent[first + k] not in before
+        changes.append(Change(rows[first].time, row.time, reasons, pair, zeros, loaded))
     nights = tuple(Night(row, each) for row, each in zip(rows, strengths, strict=True))
     newest = set(arms[-1])
     left = sorted(newest.union(*arms[first:]) - newest.intersection(*arms[first:]))
@@ -222,16 +229,19 @@ def _cause(
     reasons = reasons_of(information, columns, freedom, most=1.0)
     parts = ((joint, tuple(n for n in tests.names if n.owner == joint)) for joint in pair)
     given: Changes = [(explanation_of(information, columns, freedom, *part),) for part in parts]
-    zeros = likelier(information, columns, freedom, given or [reasons])
-    names = [name for each in zeros for name in each[0].names]
-    if len(names) >= SEVERAL and all(name in columns.zeros for name in names):
+    both = [name for each in given for name in each[0].names]
+    likely = [columns.evidence(information, own)[0] for own in (reasons[0].names, both) if own]
+    loaded = reasons[0].owner == LOAD and likely[0] >= max(likely)
+    told = [reasons] if loaded else likelier(information, columns, freedom, given or [reasons])
+    names = [name for each in told for name in each[0].names]
+    if loaded or (len(names) >= SEVERAL and {*names} <= {*columns.zeros}):
         others = len(tests.names) - len(names)
         gain, whole = (
             information.explained(each)[0]
             for each in (columns.of(names), np.eye(others + len(names)))
         )
         if special.fdtrc(others, freedom, (whole - gain) / (CLEARLY**2 * others)) >= level:
-            return lag, (), (), zeros
+            return (lag, reasons, (), []) if loaded else (lag, (), (), told)
     return lag, () if several or pair else reasons, pair, []
 
 

@@ -35,11 +35,11 @@ def first():
     return first_of('ur10e')
 
 
-def first_of(chain):
+def first_of(chain, *effects):
     true, rng = plants.robot(0, chain)
     poses = simulation.measure(true, true.random_joints(60, rng), rng, *plants.SIGMAS)
     sigmas = dict(zip(('sigma_position', 'sigma_orientation'), plants.SIGMAS, strict=True))
-    result = identify(Problem(load_chain(chain), poses, **sigmas))
+    result = identify(Problem(load_chain(chain), poses, **sigmas, effects=effects))
     return result_row(result, Filing('A', plants.when(0), '', ''))
 
 
@@ -268,6 +268,7 @@ def test_a_night_of_positions_only_is_compared(first, rng):
     assert found.remarks == ()
 
 
+JOINTS = ('shoulder_lift_joint', 'elbow_joint')
 EFFECTS = ('elbow_joint.sin_1', 'elbow_joint.cos_1')
 
 
@@ -337,3 +338,20 @@ def test_a_robot_that_was_mastered_again_is_none_of_two_bumped_joints(first, rng
         rows = [replace(r, offsets=r.offsets + moved * (k >= 4)) for k, r in enumerate(rows)]
         (change,) = watch(rows, 100.0).changes
         assert str(change) == 'changed: all joints (theta): was it mastered again, or bumped?'
+
+
+def test_another_load_is_none_of_two_bumped_joints(rng):
+    """It bends two joints; nights that do not fit gravity show it as other parameters."""
+    first = first_of('ur10e', 'gravity')
+    load = 1e-3 * np.isin(first.names, [f'{j}.gravity_wrist_3_joint' for j in JOINTS])
+    rows = list(nights(first, rng, 8, (4, BUMPS[0])))
+    (bump,) = watch(rows, 100.0).changes
+    bent = [name for name in first.names if '.gravity_' in name]
+    (other,) = watch([*(without(r, *bent) for r in rows[:4]), *rows[4:]], 100.0).changes
+    assert str(bump).endswith('was it bumped?')
+    assert str(other).endswith('was it bumped, or does it carry another load?')
+    rows = [
+        replace(r, offsets=r.offsets + load * (r.time >= bump.time)) for r in nights(first, rng, 8)
+    ]
+    (change,) = watch(rows, 100.0).changes
+    assert str(change) == 'changed: the load of the arm: does it carry another one?'
