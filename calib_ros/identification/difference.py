@@ -30,7 +30,7 @@ from calib_ros.decision.several import likelier, one_by_one
 from calib_ros.errors import InputError
 from calib_ros.estimation.gain import inverse_root
 from calib_ros.estimation.identifiability import structurally_independent
-from calib_ros.estimation.levels import CONFIDENT, SCALE, chance_of
+from calib_ros.estimation.levels import CONFIDENT, SCALE, SEVERAL, chance_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.posterior import size_group
 from calib_ros.estimation.sizes import TYPICAL
@@ -89,9 +89,19 @@ class Difference(Shown):
             )
         if known:
             reasons = changes.changes_in_words(self.changed)
-            why = 'is the arm warmer, or the device another?' if warmer else 'was it bumped?'
+            why = 'is the arm warmer, or the device another?' if warmer else self._question()
             return f'{reasons}; nothing else: {why} Predictions differ by {size}'
         return f'many parameters differ, by {size}: are both of one robot? Identify again'
+
+    def _question(self) -> str:
+        first = [reason for reason, *_ in self.changed]
+        names = [name for reason in first for name in reason.names]
+        if all(reason.owner == changes.LOAD for reason in first):
+            return 'does it carry another one?'
+        zeros = len(names) >= SEVERAL and {name.kind for name in names} == {'theta'}
+        if zeros or 'all joints' in {reason.owner for reason in first}:
+            return 'was it mastered again, or bumped?'
+        return 'was it bumped?'
 
     def _repr_html_(self) -> str:
         return as_html(self.in_words(), (), (('parameter', 'change'), *self.rows()))

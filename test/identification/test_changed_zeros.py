@@ -188,7 +188,7 @@ ONE_TURN = np.radians([0.0, 0.0, 7.2, 0.0, 0.0, 0.0])
 @pytest.mark.parametrize(
     ('chain', 'change', 'owner', 'said'),
     [
-        (UR10E, lambda true: slipped(true, ALL), 'all joints', ' (theta); nothing else'),
+        (UR10E, lambda true: slipped(true, ALL), 'all joints', ' (theta); nothing else: was it m'),
         (UR10E, lambda true: slipped(true, ONE_TURN), 'elbow_joint', '.theta by +125.'),
         # Beside free frames only its elbow has a zero; an arm of two joints has none.
         (SCARA, lambda true: slipped(true, [1e-3, 2e-3, 1e-3, -2e-3]), 'elbow', '.theta by +'),
@@ -204,6 +204,15 @@ def test_two_calibrations_differ_by_all_zeros_only_if_more_than_three_show(
     found = difference(first, second)
     assert owners(found.changed) == [{owner}]
     assert f'changed: {owner}{said}' in found.in_words()
+
+
+def test_two_calibrations_with_gravity_differ_by_the_load():
+    true = faulty(UR10E, Cell(), np.random.default_rng(4))
+    bent = {f'{joint}.gravity_{UR10E.joint_names[-1]}': 5e-4 for joint in UR10E.joint_names[1:3]}
+    both = (problem(arm, 50, k) for k, arm in enumerate((true, true.with_effect_values(bent))))
+    first, second = (Calibration.of(identify(replace(p, effects=('gravity',)))) for p in both)
+    said = difference(first, second).in_words()
+    assert said.startswith('changed: the load of the arm; nothing else: does it carry another')
 
 
 @pytest.mark.parametrize(
