@@ -24,6 +24,7 @@ def bad_inputs():
     yield 'only the ending', (*csv_of, 'jugs.csv'), 'jugs.csv: No such file or directory\n'
     yield 'a link to nothing', (*csv_of, 'link.csv'), '(the link leads to gone.csv)\n'
     yield 'a column twice', (*csv_of, 'twice.csv'), 'are called x: rename all but one'
+    yield 'our own residuals', (*csv_of, 'left.csv'), 'it holds the errors of a result: give'
     yield 'too few rows', (*csv_of, 'few.csv'), 'too few different poses: 3 measured'
     yield 'only test rows', (*csv_of, 'judging.csv'), 'the table has no rows to fit'
     swapped = 'order.csv is of other joints: q1 is elbow_joint, in the chain shoulder_pan_joint; '
@@ -138,6 +139,8 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     names = sorted(load_chain('ur5e').joint_names)
     (tmp_path / 'order.settings.yaml').write_text(f'# joints: {json.dumps(names)}\n')
     (tmp_path / 'twice.csv').write_text('q1,q2,q3,q4,q5,q6,x,y,z,x\n0,0,0,0,0,0,1,2,3,4\n')
+    own = 'q1,q2,q3,q4,q5,q6,x,y,z,before_x,after_x\n0,0,0,0,0,0,1,2,3,4,5\n'
+    (tmp_path / 'left.csv').write_text(own)
     (tmp_path / 'link.csv').symlink_to('gone.csv')
     (tmp_path / 'empty').write_text('')
     (tmp_path / 'broken.yaml').write_text('joints: [\n')

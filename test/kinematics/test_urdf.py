@@ -350,7 +350,7 @@ def test_a_urdf_is_a_chain_file_whose_frames_are_unknown(tmp_path):
     path.with_suffix('.xacro').write_text(REFUSED['xacro'][0])
     with pytest.raises(ConfigError, match='run "xacro FILE'):
         load_chain(path.with_suffix('.xacro'))
-    with pytest.raises(ConfigError, match='cannot read chain file'):
+    with pytest.raises(ConfigError, match='cannot read URDF'):
         load_chain(tmp_path / 'none.urdf')
 
 
