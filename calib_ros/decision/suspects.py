@@ -143,9 +143,10 @@ def _units(chain: Chain) -> Iterator[Suspect]:
     whole = 'positions and linear joints' if _linear(chain) else 'positions'
     degrees = scale_joints(chain, 'revolute', np.radians(1.0))
     for unit, name, size in UNITS:
+        smaller = ' (or in mm, not um: --length mm)' * (unit == 'mm')
         for way, option, factor in (
             (f'in {name}, not metres', f'--length {unit}', size),
-            (f'in metres, not {name}', '--length m', 1.0 / size),
+            (f'in metres, not {name}{smaller}', '--length m', 1.0 / size),
         ):
             what, changes = f'the {whole} are {way}', scale_lengths(chain, factor)
             yield Suspect(what, option, changes)

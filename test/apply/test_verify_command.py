@@ -298,7 +298,9 @@ def test_with_quiet_a_bad_verdict_tells_its_reasons(cell, folder, run):
     assert (status, out) == (3, '')
     verdict, why, steps = [each for each in err.splitlines() if each.startswith('calib_ros: ')]
     assert verdict == 'calib_ros: No verdict: the measurements do not fit the arm'
-    assert 'the positions are in metres, not mm: --length m (' in why
+    assert (
+        'the positions are in metres, not mm (or in mm, not um: --length mm): --length m (' in why
+    )
     assert steps.startswith('calib_ros: what to do -> Check what is named ')
 
 
