@@ -39,5 +39,6 @@ def is_another(
     about = replace(information, vector=information.vector - force)
     sizes = (SPREAD ** np.linspace(-1.0, 0.5, 4)).tolist()
     roots = [columns.root(dict.fromkeys(every, size) | of_frames) for size in sizes]
-    another = mean @ (information.vector - 0.5 * force) + max(map(about.evidence, roots))
-    return bool(another > information.evidence(columns.root(times)))
+    most = about.evidence(np.array(roots)).max()
+    another = mean @ (information.vector - 0.5 * force) + most
+    return bool(another > information.evidence(columns.root(times)[np.newaxis])[0])

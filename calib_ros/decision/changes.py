@@ -156,10 +156,13 @@ class Information(Shown):
         left = (root @ (axes / np.sqrt(np.maximum(values, 1.0)))).T  # below 1 by rounding, far off
         return left.T @ (left @ self.vector), left.T @ left
 
-    def evidence(self, root: FloatArray) -> float:
-        """Return the log evidence of changes with the prior N(0, root root^T)."""
-        whole, seen = np.eye(root.shape[1]) + root.T @ self.matrix @ root, root.T @ self.vector
-        return 0.5 * float(seen @ np.linalg.solve(whole, seen) - np.linalg.slogdet(whole)[1])
+    def evidence(self, roots: FloatArray) -> FloatArray:
+        """Return the log evidence (S,) of changes with priors N(0, root root^T) of (S, P, k)."""
+        turned = np.swapaxes(roots, 1, 2)
+        whole = np.eye(roots.shape[2]) + turned @ self.matrix @ roots
+        seen = (turned @ self.vector)[:, np.newaxis]
+        gains = (seen @ np.linalg.solve(whole, np.swapaxes(seen, 1, 2))).ravel()
+        return np.asarray(0.5 * (gains - np.linalg.slogdet(whole)[1]))
 
     def explained(self, columns: FloatArray) -> tuple[float, FloatArray, FloatArray, int]:
         """Return gain, changes, their covariance and its rank for columns (P, k)."""
@@ -192,13 +195,14 @@ def reasons_of(
     evidences = [columns.evidence(information, names) for _, names in columns.sets]
     likely, times = zip(*evidences, strict=True)
     logs = np.subtract(likely, [np.log(tried[owner]) for owner, _ in columns.sets])
+    if most < 1.0 and logs.max() <= 0.0:
+        return ()
     found = [
         explanation_of(information, columns, freedom, *each, *rest)
         for each, *rest in zip(columns.sets, special.softmax(logs).tolist(), times, strict=True)
     ]
-    doubted = most < 1.0 and max(logs) <= 0.0
     # smooth errors of a device look like a warmer arm, which explains but does not claim
-    if doubted or min(e.chance for e in found if e.names != SCALES[1:]) > most:
+    if min(e.chance for e in found if e.names != SCALES[1:]) > most:
         return ()
     found.sort(key=lambda each: -each.share)
     return tuple(each for each in found if each.share > 1.0 - CONFIDENT) or (found[0],)
@@ -243,7 +247,7 @@ class ChangeColumns:
         seen = (shows > HALF_THE_DIGITS) & (left < HALF_THE_DIGITS)
         self._columns = {n: c for n, c, yes in zip(every, mapped.T, seen, strict=True) if yes}
         self._columns |= dict(zip(names, np.eye(len(names)), strict=True))
-        self._count = len(names)
+        self._count, self._roots = len(names), dict[tuple[Parameter, ...], FloatArray]()
         sets: list[tuple[str, tuple[Parameter, ...]]] = []
         other = -1 if chain.convention == 'modified' else 1  # at the far end of the row's link
         for k, joint in enumerate(chain.joint_names):
@@ -302,13 +306,16 @@ class ChangeColumns:
         self, information: Information, names: Sequence[Parameter]
     ) -> tuple[float, float]:
         """Return the log evidence of changes of k parameters, and how many typical ones."""
-        found = []
-        for k in range(SEVERAL):
-            few = min(k, 1)
-            most = {n: few if n.of_dh or n in SCALES else k for n in names}
-            times = {n: SPREAD ** (k if n in self.zeros else most[n]) for n in names}
-            found.append((information.evidence(self.root(times)) - 0.5 * k**2, SPREAD**k))
-        return max(found)
+        if (roots := self._roots.get(tuple(names))) is None:
+            found = []
+            for k in range(SEVERAL):
+                few = {n: (n.of_dh or n in SCALES) and n not in self.zeros for n in names}
+                times = {n: SPREAD ** (min(k, 1) if few[n] else k) for n in names}
+                found.append(self.root(times))
+            roots = self._roots[tuple(names)] = np.array(found)
+        logs = information.evidence(roots) - 0.5 * np.arange(SEVERAL) ** 2
+        best = int(logs.argmax())
+        return float(logs[best]), SPREAD**best
 
     def covariance(self, changed: Sequence[Sequence[Explanation]]) -> FloatArray:
         """Return the prior covariance (P, P) of changes whose sizes the data determine."""
