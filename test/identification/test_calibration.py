@@ -25,6 +25,7 @@ from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.settings import Settings
+from calib_ros.texts import dump_yaml
 
 OWNED = {'session': '', 'eye_in_hand': False, 'socket': False, 'label': ''}
 
@@ -174,7 +175,7 @@ def test_a_damaged_record_is_refused(document, key, change):
     old = document['calibration'][key]
     document['calibration'][key] = old | change if isinstance(change, dict) else change
     with pytest.raises(ConfigError, match=rf'c\.yaml: (calibration\.{key}|{key})') as refused:
-        parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml')
+        parse_calibration(dump_yaml(document), 'c.yaml')
     assert len(str(refused.value)) < 300
 
 
@@ -185,7 +186,7 @@ def test_of_a_file_of_before_what_it_tells_is_known(found):
     for key in ('covariance', 'noise_in_sigma', 'frames'):
         del record[key]
     record['nominal'] = {key: record['nominal'][key] for key in ('convention', 'joints')}
-    read = parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml')
+    read = parse_calibration(dump_yaml(document), 'c.yaml')
     q = UR.random_joints(300, np.random.default_rng(1))
     assert (read.names, read.covariance, read.noise, read.owners) == ((), None, None, {})
     assert np.isnan(replace(read, region=None).sigma(q, np.s_[3:])).all()
@@ -226,10 +227,10 @@ def test_a_file_that_was_cut_off_is_refused(found):
 def test_a_table_that_was_edited_is_not_the_calibration(document, change):
     """The region, the covariance and the verdict are those of another table."""
     document = deepcopy(document)
-    parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml', UR)
+    parse_calibration(dump_yaml(document), 'c.yaml', UR)
     change(document)
     with pytest.raises(ConfigError, match=r'c\.yaml does not contain the table and effects'):
-        parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml', UR)
+        parse_calibration(dump_yaml(document), 'c.yaml', UR)
 
 
 def test_a_file_whose_keys_were_sorted_is_the_same_calibration(found):
@@ -247,7 +248,7 @@ def test_effects_that_were_held_may_stand_before_those_fitted():
 
 
 def test_a_nominal_chain_with_other_effects_is_another(document):
-    text = yaml.safe_dump(document, sort_keys=False)
+    text = dump_yaml(document)
     parse_calibration(text, 'c.yaml', UR.with_effect_values({'elbow_joint.ratio': 0.0}))
     with pytest.raises(ConfigError, match=r'another nominal.*, with effect elbow_joint\.ratio'):
         parse_calibration(text, 'c.yaml', UR.with_effect_values({'elbow_joint.ratio': 1e-3}))

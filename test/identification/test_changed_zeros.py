@@ -13,7 +13,6 @@ from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.changes import reason_in_words
 from calib_ros.decision.mistakes import diagnose
 from calib_ros.errors import InputError
-from calib_ros.identification import recalibration
 from calib_ros.identification.recalibrated import ANEW
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.parameter import Parameter
@@ -26,12 +25,6 @@ def earlier(request):
     """Return an arm, its calibration from poses or positions, and which of these."""
     true = faulty(UR10E, Cell(), np.random.default_rng(4))
     return true, Calibration.of(identify(problem(true, 60, 0, request.param))), request.param
-
-
-@pytest.fixture
-def none_odd(monkeypatch):
-    """Let no single pose be left out, which takes longer than all else."""
-    monkeypatch.setattr(recalibration, '_without_one', lambda *_: ())
 
 
 def slipped(true, zeros):
@@ -69,9 +62,7 @@ def test_two_changed_zeros_are_told_by_name(earlier, joints):
     assert all('all joints' not in each for each in told)
 
 
-@pytest.mark.parametrize(
-    ('earlier', 'k'), [(True, 0), (False, 1), (True, 4)], indirect=['earlier']
-)
+@pytest.mark.parametrize(('earlier', 'k'), [(True, 0), (False, 1)], indirect=['earlier'])
 def test_a_zero_that_is_off_by_a_turn_of_the_motor_is_the_only_change(earlier, k, unsearched):
     """It is far larger than usual changes: other joints, or the whole link, shared it."""
     true, previous, oriented = earlier
@@ -266,6 +257,7 @@ def test_another_target_of_a_scara_leaves_its_device_where_it_stands(seed, orien
     assert rms(found.calibration.chain, now, q) < 2.0 * rms(previous.chain, true, q)
 
 
+@pytest.mark.parametrize('earlier', [True], indirect=True)
 def test_a_device_and_a_target_far_away_ask_for_their_new_frames(earlier, none_odd):
     """The remedy was to identify again."""
     true, previous, oriented = earlier
@@ -278,7 +270,7 @@ def test_a_device_and_a_target_far_away_ask_for_their_new_frames(earlier, none_o
 
 @pytest.mark.parametrize(
     ('earlier', 'new'),
-    [(False, ('base',)), (True, ('base',)), (False, ('tool',)), (True, ('base', 'tool'))],
+    [(False, ('base',)), (False, ('tool',)), (True, ('base', 'tool'))],
     indirect=['earlier'],
 )
 def test_new_frames_that_fit_their_poses_exactly_confirm_nothing(earlier, new):

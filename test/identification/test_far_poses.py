@@ -42,7 +42,7 @@ def test_a_part_in_mm_is_named_between_new_frames_too(earlier, without_noise):
 @pytest.mark.parametrize(
     ('without_noise', 'new'), [(False, ('base', 'tool')), (True, ()), (True, ('base', 'tool'))]
 )
-def test_two_positions_in_mm_update_nothing(earlier, without_noise, new, unsearched):
+def test_two_positions_in_mm_update_nothing(earlier, without_noise, new, unsearched, none_odd):
     """Between new frames the arm was moved by kilometres, or a traceback came."""
     few = seen(10, in_mm=2)
     with suppress(InputError):  # check their units

@@ -261,7 +261,7 @@ def test_smooth_errors_of_a_device_that_was_moved_are_no_change_of_the_arm(seed)
         assert not found.changed
 
 
-def test_another_arm_is_not_mended_by_8_poses(earlier):
+def test_another_arm_is_not_mended_by_8_poses(earlier, none_odd):
     true, previous = earlier
     rng = np.random.default_rng(12)
     other = replace(faulty(UR10E, Cell(), rng), base=true.base, tool=true.tool)
@@ -295,7 +295,7 @@ def test_mistakes_in_new_poses_are_named(earlier, change, said):
         recalibrate(previous, but(seen, **change(seen.observations)), 0.1)
 
 
-def test_what_moves_while_new_poses_are_measured_is_named(earlier):
+def test_what_moves_while_new_poses_are_measured_is_named(earlier, none_odd):
     true, previous = earlier
     now = true.with_offsets({'elbow_joint.theta': 1e-3})
     first, then = (problem(arm, 16, 1).observations for arm in (true, now))
