@@ -97,10 +97,11 @@ class TooFewObservationsError(InputError):
 
 def near(name: str, alternatives: Iterable[str], least: float = 0.51) -> str:
     """Return 'did you mean "...?"' with the most similar alternative, if any."""
+    small = {each.lower(): each for each in list(alternatives)[:MOST_ENTRIES]}
+    if not small or len(name) > MOST_ENTRIES:
+        return ''
     import difflib  # slow to load
 
-    likely = list(alternatives)[:MOST_ENTRIES] if len(name) <= MOST_ENTRIES else []
-    small = {each.lower(): each for each in likely}
     found = difflib.get_close_matches(name.lower(), small, n=1, cutoff=least)
     return f'did you mean "{small[found[0]]}"?' if found else ''
 
