@@ -12,7 +12,7 @@ define packages
 	|| $(or $(2),$(BIN)/python) -m pip install --quiet --disable-pip-version-check $(1); }
 endef
 
-.PHONY: demo prepared test fuzz mutants lint oldest screenshots docs clean
+.PHONY: demo prepared collected test fuzz mutants lint oldest screenshots docs clean
 
 demo: $(VENV)/commands
 	$(BIN)/calib_ros demo --out demo --force
@@ -24,6 +24,10 @@ demo: $(VENV)/commands
 	@echo '  calib_ros identify demo/bag --chain ur10e'
 
 prepared: $(VENV)/installed $(VENV)/tf2_msgs/installed $(VENV)/mocap4r2_msgs/installed
+
+# Modules are compiled, and asserts of tests rewritten, once: else by each worker of `make test`.
+collected: prepared
+	-$(BIN)/python -m pytest --collect-only --quiet > /dev/null
 
 test: prepared
 	$(BIN)/python -m pytest -n auto --dist worksteal $(PYTEST_ARGUMENTS)
