@@ -217,6 +217,7 @@ def test_plan_refuses_what_makes_no_sense(run, tmp_path, arguments, text, conten
     assert text in err
 
 
+@pytest.mark.usefixtures('unsearched')
 def test_poses_of_a_refused_table_of_another_layout_are_taken_as_advised(run, tmp_path):
     chain = arm()
     rows = simulation.measure(chain, some(chain, 9, 1), np.random.default_rng(2), 5e-5, 2e-4)

@@ -238,15 +238,6 @@ def test_one_pose_that_alone_exceeds_the_limit_is_named(arm):
     assert verify(arm, [with_errors(arm, errors[2:7])], 1e-4).odd == ()  # too few others
 
 
-def test_repeats_do_not_count_as_more_configurations(arm):
-    errors = np.random.default_rng(0).normal(scale=1e-4, size=(6, 3))
-    once = with_errors(arm, errors)
-    often = once.select(np.tile(np.arange(6), 10))
-    first, second = (verify(arm, [each], 1e-4) for each in (once, often))
-    assert second.configurations == first.configurations == 6
-    assert second.upper == pytest.approx(first.upper, rel=1e-9)
-
-
 def test_orientations_that_are_far_off_are_told(arm):
     """Positions alone are judged; but a mistake in the table is none of the arm."""
     seen = with_errors(arm, np.random.default_rng(0).normal(scale=1e-5, size=(8, 3)))

@@ -71,18 +71,6 @@ def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, run):
     assert 'give the program as it was before calib_ros compensate' in ' '.join(out.split())
 
 
-def test_an_arm_without_correction_passes_only_with_a_remark(cell, folder, run):
-    """Its joint values tell of the calibration alone."""
-    q = UR.random_joints(8, np.random.default_rng(3))
-    (folder / 'program.csv').write_text(joints_csv(q))
-    write_csv(folder / 'measured.csv', rows_of(measured(cell[0], q), 0))
-    judge = (*VERIFY, 'result', '--tolerance', 1)
-    for more, wanted in (((), 0), (('--commanded', 'program.csv'), Status.NOT_ACCEPTED)):
-        status, out, _ = run(*judge, *more)
-        assert status == wanted
-        assert ('This judges the calibration' in ' '.join(out.split())) == (not more)
-
-
 def test_errors_are_along_the_axes_of_the_base_wherever_the_device_stands(cell, folder, run):
     """They were turned by the frame of the device where it had stood before."""
     worse = cell[0].with_offsets({'elbow_joint.a': 2e-3, 'wrist_1_joint.alpha': 2e-3})

@@ -47,8 +47,8 @@ def test_measurements_of_two_places_are_told(spread, size, told):
 @pytest.mark.parametrize(
     ('apart', 'noise', 'count', 'told'),
     [
-        *[(1e-3, 0.0, 30, '0.29'), (2e-2, 1e-3, 30, '5.8'), (0.3, 0.0, 8, '87')],
-        *[(1e-4, 0.0, 30, ''), (2e-3, 5e-4, 30, '')],
+        *[(1e-3, 0.0, 15, '0.3'), (2e-2, 1e-3, 15, '5.8'), (0.3, 0.0, 6, '87')],
+        *[(1e-4, 0.0, 15, ''), (2e-3, 5e-4, 15, '')],
     ],
 )
 def test_two_devices_are_told_by_their_turns(apart, noise, count, told):
@@ -64,9 +64,9 @@ def test_two_devices_are_told_by_their_turns(apart, noise, count, told):
         where.z += shift[2] + second * apart
         return found
 
-    drive(made, 30, [(*source, message)])
+    drive(made, 15, [(*source, message)])
     made.finish()
-    assert len(made.samples) == (30 if apart < 0.1 else 30 - count)
+    assert len(made.samples) == (15 if apart < 0.1 else 15 - count)
     assert ('two devices or targets' in made.status()) == bool(told)
     assert f'measurements at {count} stops scatter by {told} mm' in made.summary or not told
 
