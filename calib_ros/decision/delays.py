@@ -2,36 +2,176 @@
 # SPDX-License-Identifier: Apache-2.0
 """Delays in motion that are not one constant: an arm imitates them along its path.
 
-The delay of each device is fitted. Joints that are not read at one moment have delays of their
-own, and clocks that drift apart or jump one that changes, here by cosines over the session. Such a
-delay d moves a joint by -d times its speed: play with the speed for the sign of the approach.
-Where speeds are not known, joints measured in motion seem to be off at random.
+The delay of each device is fitted. Clocks that drift apart make one that changes, and stamps that
+jitter one of each measurement: errors along its velocity, which are told from those across and
+taken into account. Joints that are not read at one moment have delays of their own: a delay d
+moves a joint by -d times its speed, as play with the speed for the sign of the approach. Where
+speeds are not known, joints measured in motion seem to be off at random.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeAlias
+from functools import partial
 
 import numpy as np
+from scipy import special
 
 from calib_ros.decision.result import Identification
 from calib_ros.decision.rounding import rounded_joints
 from calib_ros.decision.steps import EXPLAINED
+from calib_ros.errors import CalibrationError
+from calib_ros.estimation.fitted import Fitted
+from calib_ros.estimation.fitting import SOME, fit
 from calib_ros.estimation.gain import gain_share
-from calib_ros.estimation.levels import ALIKE, NEARER, TELLING
+from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.system import stacked
+from calib_ros.estimation.weights import weights_of
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.parameter import Parameter
+from calib_ros.kinematics.parameter import DELAY, Parameter
 from calib_ros.kinematics.se3 import FloatArray, norms
-from calib_ros.settings import Settings
+from calib_ros.settings import EXCEPTION, Settings
 
-_Modes: TypeAlias = Callable[[Observations], FloatArray]
-"""Return how K delays make up those of N samples and L joints (K, N, L)."""
+
+def timed(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
+    """Return the problem with measurements in motion as their stamps allow, and what they tell.
+
+    Joints are moved to where a changing delay saw them. Of stamps that jitter, errors along the
+    velocity count for less.
+    """
+    told = list[str]()
+    remedy = 'Stamp all with one clock when they are taken, or stop at each pose (mode dwell)'
+    for base in sorted({each.base for each in problem.sets if _in_motion(each)}):
+        try:
+            problem, change = _without_drift(problem, Parameter(base, DELAY))
+            problem, jitter = _without_jitter(problem, Parameter(base, DELAY))
+        except (CalibrationError, np.linalg.LinAlgError):  # told by the whole fit
+            break
+        if change:
+            told.append(
+                f'{base}.delay changes by {1e3 * change:.2g} ms over the session, which is taken '
+                f'into account: clocks drift apart or jump. {remedy}'
+            )
+        if jitter:
+            told.append(
+                f'measurements of {base} are early or late by {1e3 * jitter:.2g} ms at random: '
+                'stamps jitter, or the device or the joint states are smoothed. Errors along the '
+                f'motion count for less. {remedy}'
+            )
+    return problem, tuple(told)
+
+
+def _in_motion(each: Observations) -> bool:
+    return each.moving and each.distances is None and each.pixels is None
+
+
+def _lacking(fitted: Fitted) -> bool:
+    return fitted.noise.position > 1.0 or bool(fitted.robust.outliers.mean() > EXCEPTION)
+
+
+def _changed(
+    problem: Problem, delay: Parameter, change: Callable[[Observations], Observations]
+) -> Problem:
+    """Return the problem with other measurements in motion by the device with a delay."""
+    fitted, judging = (
+        [change(e) if e.base == delay.owner and _in_motion(e) else e for e in sets]
+        for sets in (problem.sets, problem.judging)
+    )
+    return problem.with_sets(fitted, held_out=judging)
+
+
+def _without_drift(given: Problem, delay: Parameter) -> tuple[Problem, float]:
+    """Return a problem with joints where they were seen, and how much the delay changes [s].
+
+    By polynomials in time of the delay, fitted beside all parameters.
+    """
+    stamps = np.concatenate([e.stamps_ns for e in given.sets if e.base == delay.owner])
+    first, whole = stamps.min(), max(np.ptp(stamps), 1)
+    problem, sizes = given, np.zeros(TELLING)
+
+    def waves(each: Observations) -> FloatArray:
+        times = np.clip(2.0 * ((each.stamps_ns - first) / whole) - 1.0, -1.0, 1.0)
+        return np.polynomial.legendre.legvander(times, TELLING)[:, 1:]
+
+    def moved(each: Observations) -> Observations:
+        read = np.zeros(len(each)) if each.delay is None else each.delay
+        return replace(each.earlier(read + waves(each) @ sizes), delay=each.delay)
+
+    for _ in range(SEVERAL):
+        fitted, rows = _rows(problem, delay)
+        count = len(rows[0]) - 2
+        for k, each in enumerate(fitted.problem.sets):
+            added = rows[k][count] * waves(each).T[:, np.newaxis] * (each.base == delay.owner)
+            rows[k] = np.concatenate([rows[k][:count], added, rows[k][-1:]])
+        matrix = stacked(rows)
+        share, rest = gain_share(matrix, count), len(matrix) - count - TELLING
+        told = share > EXCEPTION and _lacking(fitted)
+        if not told or chance_of(share / (1.0 - share) * rest, TELLING, rest) > 1.0 - SURE:
+            break
+        sizes += np.linalg.lstsq(matrix[:, :-1], matrix[:, -1])[0][count:]
+        problem = _changed(given, delay, moved)
+    changes = [waves(e) @ sizes for e in given.sets if e.base == delay.owner]
+    return problem, float(np.ptp(np.concatenate(changes)))
+
+
+def _without_jitter(problem: Problem, delay: Parameter) -> tuple[Problem, float]:
+    """Return a problem with larger covariances along the velocity, and the jitter [s].
+
+    Told by errors along it that are larger than those across. A fit to these is nearer to the arm,
+    and tells more.
+    """
+    mine = [k for k, e in enumerate(problem.sets) if e.base == delay.owner and _in_motion(e)]
+    found = 0.0
+    for _ in range(SEVERAL):
+        fitted, rows = _rows(problem, delay)
+        matrix = stacked(rows)
+        late = np.append(-np.linalg.lstsq(matrix[:, :-1], matrix[:, -1])[0], 1.0)
+        few = np.concatenate([rows[k][:, :3] for k in mine], axis=2)
+        speed, errors = few[-2].T, np.tensordot(late, few, 1).T
+        squares = np.maximum((speed**2).sum(axis=1), 1e-300)
+        along = np.einsum('nc,nc->n', speed, errors) ** 2 / squares
+        across = np.median(norms(errors) ** 2 - along) / special.chdtri(2, 0.5)
+        jitter = np.median((along / special.chdtri(1, 0.5) - across) / squares)  # squared
+        told = found > 0.0 or _lacking(fitted)
+        if not told or jitter * np.median(squares) <= across:
+            break
+        ratio = jitter / max(across, 1e-300)
+        found += ratio
+        problem = _changed(problem, delay, partial(_widened, fitted, delay, ratio))
+    return problem, float(np.sqrt(found * across))
+
+
+def _widened(fitted: Fitted, delay: Parameter, jitter: float, each: Observations) -> Observations:
+    """Return measurements whose delay has a variance (of `jitter`, in that of the noise)."""
+    turned = np.full_like(each.oriented, each.oriented.any())
+    plain = Samples(each.changed(covariance=None, oriented=turned), 1.0, 1.0)
+    moved = plain.rows_of(fitted.chain, [delay])[0]
+    problem = fitted.problem
+    wide = each.covariances((problem.sigma_position, problem.sigma_orientation))
+    wide[:, : len(moved), : len(moved)] += jitter * np.einsum('in,jn->nij', moved, moved)
+    return replace(each, covariance=wide)
+
+
+def _rows(problem: Problem, delay: Parameter) -> tuple[Fitted, list[FloatArray]]:
+    """Return a fit to some samples, and their rows (P, c, N): of a delay, then the residual.
+
+    Those of delays of single joints are before them. Gross errors count for less: a part of the
+    session may seem to be some.
+    """
+    fitted = fit(problem.with_sets(each.spread(SOME) for each in problem.sets))
+    lags, few = effects.members(fitted.chain, 'backlash'), fitted.problem.sets
+    lags = () if set(lags) & set(fitted.names) else lags
+    if lags:
+        few = tuple(replace(each, approach=each.velocity) for each in few)
+    weights = [weights_of(each, 'huber') for each in fitted.robust.distances]
+    system = problem.system(few).weighted(weights)
+    chain, names = fitted.chain.with_effects(lags), [*fitted.names, *lags, delay]
+    return fitted, system.rows_of(chain, names)
 
 
 def uneven(problem: Problem, result: Identification) -> tuple[str, Problem] | None:
@@ -42,34 +182,21 @@ def uneven(problem: Problem, result: Identification) -> tuple[str, Problem] | No
     lags = [Parameter(name) for name in effects.members(result.chain, 'backlash')]
     if set(lags) & set(result.names):
         return None
-    stamps = np.concatenate([each.stamps_ns for each in problem.sets])
-    first, whole = stamps.min(), max(np.ptp(stamps), 1)
-
-    def by_joint(each: Observations) -> FloatArray:
-        return np.eye(len(lags))[:, np.newaxis].repeat(len(each), axis=1)
-
-    def in_time(each: Observations) -> FloatArray:
-        order = np.arange(1, 1 + TELLING)
-        waves = np.cos(np.pi * np.outer(order, (each.stamps_ns - first) / whole))
-        return waves[..., np.newaxis].repeat(len(lags), axis=2)
-
-    by_play, _, _ = _explained(problem, result, lags, by_joint, np.sign)
-    found = [(_explained(problem, result, lags, m, np.positive), m) for m in (by_joint, in_time)]
-    (share, sizes, strong), modes = max(found, key=lambda each: each[0][0])
+    by_play, _, _ = _explained(problem, result, lags, np.sign)
+    share, sizes, strong = _explained(problem, result, lags, np.positive)
     if share < EXPLAINED or share < by_play:
         return None
-    text = 'a delay that changes explains'
-    remedy = 'clocks drift apart or jump: stamp with one clock'
-    if modes is by_joint:
-        text = 'joints late by different times explain'
-        remedy = f'above all {lags[int(np.argmax(strong))].owner}: read all joints at one moment'
-    text += f' {100.0 * share:.0f} % of the residuals, {remedy}, or stop at each pose (mode dwell)'
+    text = (
+        f'joints late by different times explain {100.0 * share:.0f} % of the residuals, above '
+        f'all {lags[int(np.argmax(strong))].owner}: read all joints at one moment, or stop at '
+        'each pose (mode dwell)'
+    )
     own = [list(problem.chain.joint_names).index(name.owner) for name in lags]
     sets = []
     for each in problem.sets:
         joints = each.joints.copy()
         if each.velocity is not None:
-            joints[:, own] += each.velocity[:, own] * np.einsum('k,knl->nl', sizes, modes(each))
+            joints[:, own] += each.velocity[:, own] * sizes
         sets.append(replace(each, joints=joints))
     return text, problem.with_sets(sets)
 
@@ -118,16 +245,12 @@ def _explained(
     problem: Problem,
     result: Identification,
     lags: list[Parameter],
-    modes: _Modes,
     rate: Callable[[FloatArray], FloatArray],
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Return the share of the residual squares by K delays, their sizes and effects (K,)."""
+    """Return the share of the residual squares by L delays, their sizes and effects (L,)."""
     few, count = [each.spread() for each in problem.sets], len(result.names)
     few = [replace(s, approach=None if s.velocity is None else rate(s.velocity)) for s in few]
-    rows = problem.system(few).rows_of(result.chain.with_effects(lags), [*result.names, *lags])
-    for k, each in enumerate(few):
-        added = np.einsum('knl,lcn->kcn', modes(each), rows[k][count:-1])
-        rows[k] = np.concatenate([rows[k][:count], added, rows[k][-1:]])
-    matrix = stacked(rows)
+    chain, names = result.chain.with_effects(lags), [*result.names, *lags]
+    matrix = stacked(problem.system(few).rows_of(chain, names))
     delays = np.asarray(np.linalg.lstsq(matrix[:, :-1], matrix[:, -1])[0][count:])
     return gain_share(matrix, count), delays, np.abs(delays) * norms(matrix[:, count:-1].T)

@@ -247,14 +247,14 @@ class Observations(Shown):
         """Return the pairs with other stamps (N,)."""
         return replace(self, stamps_ns=stamps_ns)
 
-    def earlier(self, delay: float | None) -> Observations:
-        """Return the measurements with the joint values a delay [s] before the stamps.
+    def earlier(self, delay: float | FloatArray | None) -> Observations:
+        """Return the measurements with the joint values a delay [s] (N,) before the stamps.
 
         By velocity and acceleration; without them the arm was at rest and nothing changes.
         """
         if self.velocity is None or delay is None:
             return self
-        delays = np.full(len(self), float(delay))
+        delays = np.full(len(self), delay, dtype=float)
         more = (delays if self.delay is None else delays - self.delay)[:, np.newaxis]
         if not more.any():
             return self

@@ -19,6 +19,7 @@ from calib_ros.annotated import as_annotated
 from calib_ros.decision import mistakes, plausibility
 from calib_ros.decision.acceptance import oddities, refusals
 from calib_ros.decision.comparison import compare
+from calib_ros.decision.delays import timed
 from calib_ros.decision.drift import chance_of_gain
 from calib_ros.decision.misfits import arms_own, coupling_share, outliers_of
 from calib_ros.decision.region import Region
@@ -70,7 +71,9 @@ def identify(
     fit diverges; the message names the mistake that explains it, if any.
     """
     try:
+        problem, late = timed(problem)
         result = _identified(problem, simpler, progress)
+        result = replace(result, remarks=(*late, *result.remarks))
         told = sorted(result.refusals, key=lambda each: each.rule.value)
         return replace(result, refusals=tuple(told))
     except np.linalg.LinAlgError as err:

@@ -12,6 +12,7 @@ import numpy as np
 
 from calib_ros.annotated import as_annotated
 from calib_ros.decision.comparison import GroupVerdict
+from calib_ros.decision.delays import timed
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.levels import SEVERAL
 from calib_ros.estimation.problem import Problem
@@ -33,6 +34,7 @@ def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Id
     progress(f'model {"geometric" if model == "auto" else model}')
     if model != 'auto':
         return identify(replace(problem, effects=effects_of(model)), progress=progress)
+    problem, late = timed(problem)
     poses = max(1, sum(map(len, problem.sets)))
     columns = 2 * len(HARMONICS) * len(problem.chain.joints)
     fit, tried = len(problem.free) * poses, columns * min(poses, COMPARED)
@@ -51,7 +53,7 @@ def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Id
             result = replace(result, remarks=(*result.remarks, remark))
         else:
             result = richer
-    return replace(result, verdicts=verdicts)
+    return replace(result, verdicts=verdicts, remarks=(*late, *result.remarks))
 
 
 def _choose_effects(
