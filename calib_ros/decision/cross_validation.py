@@ -5,17 +5,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.residuals import Residuals, joined, residuals
 from calib_ros.estimation.configurations import count_distinct
+from calib_ros.estimation.evidence import Inference
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.leastsquares import leave_fold_out
 from calib_ros.estimation.levels import TELLING
-from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.observations import Observations, stations
+from calib_ros.estimation.problem import Learned, Problem
+from calib_ros.estimation.system import System
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import Index
 
@@ -23,28 +26,42 @@ from calib_ros.kinematics.se3 import Index
 def cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Comparison | None, str]:
     """Judge both chains on folds of configurations that were not fitted; None if too few.
 
+    Between few stations an arm imitates a moved device: all poses of one are in the same fold.
     A `note` (why not by held-out pairs) stands behind the text.
     """
-    problem, names = fitted.problem, fitted.names
-    groups = problem.configurations
-    count = count_distinct(np.concatenate(groups))
+    problem, names, system = fitted.problem, fitted.names, fitted.system
     rows = sum(
         count_distinct(group) * each.width
-        for group, each in zip(groups, problem.sets, strict=True)
+        for group, each in zip(problem.configurations, problem.sets, strict=True)
     )
+    groups, what = stations(problem.sets), 'poses'
+    count = count_distinct(np.concatenate(groups))
+    if count < count_distinct(np.concatenate(problem.configurations)):
+        what, system = 'stations', _with_usual_priors(fitted)
     folds = _fold_count(problem, names, count, rows)
     if folds < 2:
         return None, 'nothing: too few poses to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
     numbers = [group % folds for group in groups]
     order = [np.argsort(each, kind='stable') for each in numbers]
-    by_fold = fitted.system.select(order), [*map(np.sort, numbers)]  # sorted once
+    by_fold = system.select(order), [*map(np.sort, numbers)]  # sorted once
     fits = (before, frames), (fitted.chain, names)
     chains = zip(*(leave_fold_out(one, some, *by_fold) for one, some in fits), strict=True)
     pair = fold_residuals(chains, problem.sets, groups, numbers)
     judged = Comparison(*pair, ~fitted.robust.outliers)
-    over = f'{folds}-fold cross-validation over {count:,} different poses'
+    over = f'{folds}-fold cross-validation over {count:,} different {what}'
     return judged, f'{over}{note}{judged.omitted}'
+
+
+def _with_usual_priors(fitted: Fitted) -> System:
+    """Return the system with priors, because some stations may not determine the fit."""
+    problem, weights = fitted.problem, [each.weights for each in fitted.system.sets]
+    if problem.learned is None:
+        found = Inference(fitted, fitted.size).likeliest().priors
+        arm = (n for n in fitted.names if not problem.model.owns_frame(n))
+        priors = {n: min(found[n], problem.common_sense(n)) for n in arm}
+        problem = replace(problem, learned=Learned(priors, fitted.size))
+    return problem.system(problem.sets).weighted(weights)
 
 
 def fold_residuals(

@@ -16,7 +16,7 @@ from calib_ros.decision.places import leave_one_place_out, places_of
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.levels import ALIKE, SURE
-from calib_ros.estimation.observations import Observations, numbered
+from calib_ros.estimation.observations import Observations, stations
 from calib_ros.estimation.posterior import Posterior
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.weights import OUTLIER, distances_of
@@ -70,7 +70,7 @@ def _of_held_out(
 def _repeated(problem: Problem) -> Flags:  # held-out pairs (N,)
     if not problem.judging:
         return np.zeros(0, dtype=bool)
-    numbers = numbered(problem.all_sets)
+    numbers = stations(problem.all_sets)
     count = len(problem.sets)
     return np.isin(np.concatenate(numbers[count:]), np.concatenate(numbers[:count]))
 

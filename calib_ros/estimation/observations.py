@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from calib_ros.annotated import as_annotated, check_fields
 from calib_ros.errors import InputError
-from calib_ros.estimation.configurations import configurations, renumber, stops
+from calib_ros.estimation.configurations import SCATTER, STILL, configurations, renumber, stops
+from calib_ros.estimation.levels import NEARER, TELLING
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.shown import Shown
@@ -352,4 +353,24 @@ def numbered(sets: Sequence[Observations]) -> tuple[Index, ...]:
     if len(sets) == 1:
         return (sets[0].configurations,)
     numbers = configurations(np.concatenate([each.joints for each in sets]))
+    return tuple(np.split(numbers, np.cumsum([len(each) for each in sets])[:-1]))
+
+
+def stations(sets: Sequence[Observations]) -> tuple[Index, ...]:
+    """Return at which of few stations each pair (N,) of each set is, counted over all sets.
+
+    Half of the joints or more, which seldom move from stop to stop, stand still at a station.
+    Without stations, or at many, these are the configurations.
+    """
+    joints = np.concatenate([each.joints for each in sets])
+    ordered = joints[np.argsort(np.concatenate([s.stamps_ns for s in sets]), kind='stable')]
+    begins = np.flatnonzero(np.diff(stops(ordered), prepend=-1))
+    moves = (np.abs(np.diff(ordered[begins], axis=0)) > STILL).mean(axis=0)
+    seldom = (moves > 0.0) & (moves < NEARER)
+    if not 0.5 <= seldom.sum() / max(np.count_nonzero(moves), 1) < 1.0:
+        return numbered(sets)
+    numbers = configurations(joints[:, seldom])
+    places = [joints[numbers == k][:, seldom] for k in range(numbers.max() + 1)]
+    if len(places) > TELLING or any((np.ptp(each, axis=0) > SCATTER).any() for each in places):
+        return numbered(sets)
     return tuple(np.split(numbers, np.cumsum([len(each) for each in sets])[:-1]))
