@@ -52,7 +52,8 @@ class Observations(Shown):
     """(N, 6, 6) of x, y, z [m] and the rotation about the world's x, y, z axes [rad], as in
     PoseWithCovariance; NaN rows where unknown."""
     approach: FloatArray | None = None
-    """(N, n) signs of the velocities with which the joints reached their values, for backlash."""
+    """(N, n) signs of the velocities with which the joints reached their values, for backlash; by
+    default those of `velocity`."""
     distances: FloatArray | None = None
     """(N,) [m] from the origin of the world to the target, for draw-wires and ball-bars.
     Positions and rotations are then ignored."""
@@ -83,6 +84,8 @@ class Observations(Shown):
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.approach is None and self.velocity is not None:
+            object.__setattr__(self, 'approach', np.sign(self.velocity))
         if not (self.base.startswith('base') and self.tool.startswith('tool')):
             ends = f'"{self.base:.100}" and "{self.tool:.100}"'
             raise InputError(f'the names of frames begin with base and tool, not as {ends}')

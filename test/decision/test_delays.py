@@ -43,7 +43,7 @@ def test_a_late_joint_is_brought_back_to_where_it_was():
 def test_a_delay_that_changes_is_undone_where_the_arm_moved():
     """Of held-out poses, too; at drifts of 50 ppm arms came out 0.4 mm worse."""
     delays = 4e-3 * np.cos(np.linspace(0.0, 2.0 * np.pi, 100))[:, np.newaxis]
-    seen, at_rest = moving(100, delays), replace(moving(20), velocity=None)
+    seen, at_rest = moving(100, delays), replace(moving(20), velocity=None, approach=None)
     fitted, judging = seen.select(np.arange(100) % 5 > 0), seen.select(np.arange(100) % 5 == 0)
     problem = Problem(UR10E, fitted, judging, more=(at_rest,), **SIGMAS)
     there, (told,) = timed(problem)
@@ -85,7 +85,7 @@ def test_of_stamps_that_jitter_errors_along_the_motion_count_for_less(oriented):
 )
 def test_joints_late_at_unknown_speeds_seem_off_at_random(late, errors, reasons, remarks):
     """Such a result is refused if the correction hardly helps."""
-    seen = replace(moving(60, late, errors=errors), velocity=None)
+    seen = replace(moving(60, late, errors=errors), velocity=None, approach=None)
     result = identify(Problem(UR10E, seen, **SIGMAS))
     found = [
         [each for each in told if 'at random' in each]
@@ -97,7 +97,7 @@ def test_joints_late_at_unknown_speeds_seem_off_at_random(late, errors, reasons,
 
 def test_noise_of_the_device_is_no_motion():
     """Twenty times what is stated: the correction lowers the error by less than a third."""
-    seen = replace(moving(60, noise=20.0 * np.array(NOISE)), velocity=None)
+    seen = replace(moving(60, noise=20.0 * np.array(NOISE)), velocity=None, approach=None)
     result = identify(Problem(UR10E, seen, **SIGMAS))
     assert result.accepted
     assert not any('at random' in each for each in result.remarks)

@@ -71,6 +71,15 @@ def test_arrays_that_cannot_be_are_refused(arrays, complaint):
         Observations.from_arrays(*arrays)
 
 
+def test_speeds_tell_from_which_side_joints_came(rng):
+    """Play in motion was not considered without the signs: an arm went from 0.10 to 0.61 mm."""
+    seen = Observations.from_arrays(np.zeros((4, 3)), np.zeros((4, 3)))
+    speeds, known = rng.normal(size=(2, 4, 3))
+    assert seen.approach is None
+    assert (replace(seen, velocity=speeds).approach == np.sign(speeds)).all()
+    assert (replace(seen, velocity=speeds, approach=known).approach == known).all()
+
+
 def test_a_plane_needs_heights():
     with pytest.raises(InputError, match='a plane needs the heights over it as distances'):
         replace(Observations.from_arrays(SIX, THREE), plane=True)
