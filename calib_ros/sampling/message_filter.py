@@ -71,7 +71,9 @@ class MessageFilter:
             values = numbers[:, index]
             for place in np.flatnonzero(index == NOWHERE):
                 values[:, place] = self._names.held[columns[place]]
-            places, *_, stamps, values = self._usable(part._replace(numbers=values))
+            own = '', *(names[k] for k in index)
+            part = part._replace(strings=own, numbers=values)
+            places, *_, stamps, values = self._usable(part)
             if not len(stamps):
                 continue
             good = True

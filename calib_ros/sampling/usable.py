@@ -33,9 +33,9 @@ def usable(found: Part, joints: bool = False) -> tuple[Flags, Counter[str]]:
     refuse(found.stamps == 0, NO_STAMP)
     refuse(found.stamps < 0, Lost('negative stamp (is the clock set?)'))
     if joints:
-        size = np.abs(numbers).max(axis=1)
-        refuse(~np.isfinite(size), 'NaN or infinite joint value')
-        refuse(size > LARGEST, 'joint value beyond 1e6')
+        for name, value in zip(found.strings[1:], numbers.T, strict=True):
+            refuse(~np.isfinite(value), f'NaN or infinite joint value ({name})')
+            refuse(np.abs(value) > LARGEST, f'joint value beyond 1e6 ({name})')
         return good, causes
     if found.source and found.source.board:
         return good, causes

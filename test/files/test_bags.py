@@ -238,8 +238,8 @@ def test_bad_measurements_are_dropped_and_counted_by_cause(tmp_path):
 
 BAD_JOINTS = [
     (joint_state(0), 'joints: zero stamp (fill header.stamp where it is published)'),
-    (joint_state(55 * MS, (0.1, np.nan, 0.3)), 'joints: NaN or infinite joint value'),
-    (joint_state(55 * MS, (0.1, np.inf, 0.3)), 'joints: NaN or infinite joint value'),
+    (joint_state(55 * MS, (0.1, np.nan, 0.3)), 'joints: NaN or infinite joint value (b)'),
+    (joint_state(55 * MS, (0.1, np.inf, 0.3)), 'joints: NaN or infinite joint value (b)'),
     (joint_state(55 * MS, (0.1, 0.2)), 'joints: names and positions differ in number'),
 ]
 OTHERS = [joint_state(55 * MS, (0.1,), ('gripper',)), joint_state(55 * MS, (), ())]

@@ -223,7 +223,7 @@ def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
 @pytest.mark.parametrize(
     ('stamp', 'value', 'cause'),
     [
-        (10**18, np.nan, 'NaN or infinite joint value'),
+        (10**18, np.nan, 'NaN or infinite joint value (shoulder_pan_joint)'),
         (0, 0.1, 'zero stamp (fill header.stamp where it is published)'),
     ],
 )
