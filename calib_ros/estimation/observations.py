@@ -368,12 +368,14 @@ def stations(sets: Sequence[Observations]) -> tuple[Index, ...]:
     joints = np.concatenate([each.joints for each in sets])
     ordered = joints[np.argsort(np.concatenate([s.stamps_ns for s in sets]), kind='stable')]
     begins = np.flatnonzero(np.diff(stops(ordered), prepend=-1))
-    moves = (np.abs(np.diff(ordered[begins], axis=0)) > STILL).mean(axis=0)
-    seldom = (moves > 0.0) & (moves < NEARER)
-    if not 0.5 <= seldom.sum() / max(np.count_nonzero(moves), 1) < 1.0:
-        return numbered(sets)
-    numbers = configurations(joints[:, seldom])
-    places = [joints[numbers == k][:, seldom] for k in range(numbers.max() + 1)]
-    if len(places) > TELLING or any((np.ptp(each, axis=0) > SCATTER).any() for each in places):
+    moves = np.abs(np.diff(ordered[begins], axis=0)) > STILL
+    times, moving = moves.sum(axis=0), np.count_nonzero(moves.any(axis=0))
+    seldom = joints[:, (times > 0) & (times < NEARER * len(moves))]
+    numbers = np.full(len(joints), TELLING)  # not yet at any
+    for k in range(TELLING if moving <= 2 * seldom.shape[1] < 2 * moving else 0):
+        first = seldom[(numbers == TELLING).argmax()]
+        near = np.abs(seldom - first).max(axis=1) <= SCATTER
+        numbers[near] = np.minimum(numbers[near], k)
+    if TELLING in numbers or not numbers.any():
         return numbered(sets)
     return tuple(np.split(numbers, np.cumsum([len(each) for each in sets])[:-1]))

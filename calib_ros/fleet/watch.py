@@ -235,12 +235,10 @@ def _cause(
     told = [reasons] if loaded else likelier(information, columns, freedom, given or [reasons])
     names = [name for each in told for name in each[0].names]
     if loaded or (len(names) >= SEVERAL and {*names} <= {*columns.zeros}):
-        others = len(tests.names) - len(names)
-        gain, whole = (
-            information.explained(each)[0]
-            for each in (columns.of(names), np.eye(others + len(names)))
-        )
-        if special.fdtrc(others, freedom, (whole - gain) / (CLEARLY**2 * others)) >= level:
+        every = np.eye(len(tests.names))
+        gain, whole = (information.explained(each)[0] for each in (columns.of(names), every))
+        left = (whole - gain) / CLEARLY**2
+        if chance_of(left, len(every) - len(names), freedom) >= level:
             return (lag, reasons, (), []) if loaded else (lag, (), (), told)
     return lag, () if several or pair else reasons, pair, []
 
