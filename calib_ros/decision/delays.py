@@ -25,7 +25,7 @@ from calib_ros.errors import CalibrationError
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import SOME, fit
 from calib_ros.estimation.gain import gain_share
-from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING, chance_of
+from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples
@@ -48,8 +48,8 @@ def timed(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
     remedy = 'Stamp all with one clock when they are taken, or stop at each pose (mode dwell)'
     for base in sorted({each.base for each in problem.sets if _in_motion(each)}):
         try:
-            problem, change = _without_drift(problem, Parameter(base, DELAY))
-            problem, jitter = _without_jitter(problem, Parameter(base, DELAY))
+            steady, change = _without_drift(problem, Parameter(base, DELAY))
+            problem, jitter = _without_jitter(steady, Parameter(base, DELAY))
         except (CalibrationError, np.linalg.LinAlgError):  # told by the whole fit
             break
         if change:
@@ -108,10 +108,10 @@ def _without_drift(given: Problem, delay: Parameter) -> tuple[Problem, float]:
         for k, each in enumerate(fitted.problem.sets):
             added = rows[k][count] * waves(each).T[:, np.newaxis] * (each.base == delay.owner)
             rows[k] = np.concatenate([rows[k][:count], added, rows[k][-1:]])
-        matrix = stacked(rows)
-        share, rest = gain_share(matrix, count), len(matrix) - count - TELLING
-        told = share > EXCEPTION and _lacking(fitted)
-        if not told or chance_of(share / (1.0 - share) * rest, TELLING, rest) > 1.0 - SURE:
+        matrix, poses = stacked(rows), sum(each.shape[-1] for each in rows)
+        share = gain_share(matrix, count)  # late poses have all their errors together
+        chance = special.betainc(0.5 * (poses - TELLING), 0.5 * TELLING, max(1.0 - share, 0.0))
+        if not (share > EXCEPTION and chance < 1.0 - SURE and _lacking(fitted)):
             break
         sizes += np.linalg.lstsq(matrix[:, :-1], matrix[:, -1])[0][count:]
         problem = _changed(given, delay, moved)

@@ -79,6 +79,14 @@ def test_of_stamps_that_jitter_errors_along_the_motion_count_for_less(oriented):
     assert timed(there)[1] == ()
 
 
+def test_stamps_that_jitter_are_no_drift():
+    """All errors of a late pose belong together: counted singly, they were told as both."""
+    for seed in range(3):
+        late = np.random.default_rng(seed).normal(scale=4e-3, size=(40, 1))
+        (told,) = timed(Problem(UR10E, moving(40, late), **SIGMAS))[1]
+        assert 'at random' in told
+
+
 @pytest.mark.parametrize(
     ('late', 'errors', 'reasons', 'remarks'),
     [(30e-3, 1.0, 1, 0), (15e-3, 2.0, 1, 0), (6e-3, 1.0, 0, 1), (15e-3, 8.0, 0, 1)],
