@@ -321,7 +321,7 @@ def result_files(
     loaded, result, origin = found.loaded, found.result, found.origin
     with screen.work('writing the report') as work:
         work('residuals.csv, 1 of 3')
-        poses = poses_of(loaded.problem, result, loaded.by_line, loaded.images)
+        poses = poses_of(result, loaded.by_line, loaded.images)
         contents: common.Contents = {
             'result.json': _document(found) + '\n',
             'residuals.csv': poses.table(share_of(work, 0.0, 1 / 3)),

@@ -21,6 +21,7 @@ from calib_ros.estimation.levels import CONFIDENT, KNOWN
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observability import correlated
 from calib_ros.estimation.posterior import Posterior
+from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.uncertainty import Uncertainty
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -58,7 +59,8 @@ class Identification(Shown):
     """Observability indices o1 to o5."""
     priors: dict[str, float]
     """Standard deviations [m, rad] known beforehand."""
-    world_frame: str
+    problem: Problem
+    """The pairs as fitted: corrected where clocks drift or stamps jitter."""
     converged: bool
     chance: float | None
     """Probability that drift of the device, shared by successive measurements, would let the arm's

@@ -125,7 +125,7 @@ def _identified(
         gauges=_gauges(fitted),
         observability=observability(fitted.factor, robust.system.count),
         priors=_priors(problem),
-        world_frame=problem.world_frame,
+        problem=problem,
         converged=before.converged and robust.fit.converged and robust.settled,
         chance=_chance(fitted, before.chain),
         refusals=wrong,

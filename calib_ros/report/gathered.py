@@ -16,7 +16,6 @@ from calib_ros.decision.result import Identification
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.pixels import samples_of
-from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -74,14 +73,12 @@ def _poses(
 
 
 def poses_of(
-    problem: Problem,
-    result: Identification,
-    by_line: bool = False,
-    images: Mapping[int, str] = NAMELESS,
+    result: Identification, by_line: bool = False, images: Mapping[int, str] = NAMELESS
 ) -> Poses:
     """Return all poses of an identification, judged ones by a fit without them."""
     sizes = np.concatenate(result.distances)
-    judged, sets = result.validation, problem.system(problem.sets).sets
+    judged, problem = result.validation, result.problem
+    sets = problem.system(problem.sets).sets
     if judged is None or judged.repeated is not None:
         groups = [(sets, result.fitted, np.full(len(sizes), FITTED), sizes)]
     else:  # each was left out once

@@ -59,7 +59,7 @@ def identification_report(
 ) -> Report:
     """Return the report of an identification; `wanted_mm` is the wanted RMS error."""
     problem, judged = loaded.problem, result.comparison
-    poses = poses or poses_of(problem, result, loaded.by_line, loaded.images)
+    poses = poses or poses_of(result, loaded.by_line, loaded.images)
     reasons = advice_of(problem, result)
     text = filter(None, _text(result, reasons, wanted_mm))
     shown = 2 if result.accepted else int(bool(_sound(reasons)))

@@ -222,8 +222,9 @@ class Identifying:
         scale = self._node.get_parameter('marker_scale').value
         now = self._node.get_clock().now().to_msg()
         seen = to_ros.in_hand(loaded.owners)
-        world = self._node.get_parameter('target_frame').value if seen else result.world_frame
-        markers = to_ros.residual_markers(result, loaded.problem.sets, scale, world, now)
+        given_frame = self._node.get_parameter('target_frame').value
+        world = given_frame if seen else loaded.problem.world_frame
+        markers = to_ros.residual_markers(result, scale, world, now)
         self._residuals.publish(markers)
         page = partial(_page, given, result)
         if result.accepted:

@@ -23,7 +23,6 @@ from visualization_msgs.msg import Marker, MarkerArray
 from calib_ros.decision.residuals import residuals
 from calib_ros.decision.result import Identification
 from calib_ros.errors import MOST_ENTRIES
-from calib_ros.estimation.observations import Observations
 from calib_ros.identification.records import Owner
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray, invert, to_quat
@@ -93,7 +92,7 @@ def cloud(fields: Sequence[str], rows: FloatArray, frame_id: str, stamp: Any) ->
 
 
 def residual_markers(
-    result: Identification, sets: Sequence[Observations], scale: float, frame_id: str, stamp: Any
+    result: Identification, scale: float, frame_id: str, stamp: Any
 ) -> MarkerArray:
     """Return the residual at each measured position, enlarged `scale` times.
 
@@ -106,7 +105,7 @@ def residual_markers(
     lines.pose.orientation.w = 1.0
     lines.scale.x = 0.002
     base = result.chain.frame('base').matrix
-    for each in sets:
+    for each in result.problem.sets:
         if each.distances is not None or each.points is not None:
             continue
         left = residuals(result.chain, each).position

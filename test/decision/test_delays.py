@@ -9,6 +9,7 @@ from fits import NOISE, SIGMAS, UR10E, arm, rms
 
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
+from calib_ros.decision.comparison import compare
 from calib_ros.decision.delays import other_delay, timed, uneven
 from calib_ros.decision.reasons import Rule
 from calib_ros.kinematics.se3 import exp_rotation
@@ -55,6 +56,9 @@ def test_a_delay_that_changes_is_undone_where_the_arm_moved():
     (rest,) = there.more
     np.testing.assert_array_equal(rest.joints, at_rest.joints)
     assert timed(there)[1] == ()
+    result = identify(problem)
+    again = compare(result.before, result.chain, result.problem.judging)
+    np.testing.assert_array_equal(again.after.position, result.validation.after.position)
 
 
 @pytest.mark.parametrize('oriented', [True, False])

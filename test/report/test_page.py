@@ -64,7 +64,7 @@ def test_poses_are_those_judged_and_their_errors_make_the_figures(solved, folded
     if folded:
         problem = replace(problem, held_out=None)
         result = identify(problem)
-    poses = poses_of(problem, result)
+    poses = poses_of(result)
     assert len(poses) == (TRAIN if folded else TRAIN + TEST)
     assert (poses.role == JUDGED).sum() == (TRAIN if folded else TEST)
     for errors, found in zip((poses.before, poses.after), result.validation.figures, strict=True):
@@ -74,7 +74,7 @@ def test_poses_are_those_judged_and_their_errors_make_the_figures(solved, folded
 
 
 def test_residuals_csv_holds_every_pose(solved):
-    poses = poses_of(*solved)
+    poses = poses_of(solved[1])
     rows = list(csv.DictReader(io.StringIO(poses.table())))
     assert len(rows) == len(poses)
     assert [int(row['stamp_ns']) for row in rows] == poses.stamps_ns.tolist()
@@ -88,7 +88,7 @@ def test_positions_alone_leave_the_orientation_out():
     rows = measured(oriented=False, count=60)
     problem = Problem(UR, rows)
     result = identify(problem)
-    poses = poses_of(problem, result)
+    poses = poses_of(result)
     assert 'after_rx' not in poses.table()
     page = page_of(report_of(problem, result))
     assert 'angle' not in [kind for kind, _ in page.data['explorer']['kinds']]
@@ -255,14 +255,14 @@ def test_no_pose_is_called_judged_where_none_was_left_out():
     problem = Problem(UR, measured(count=5))
     result = identify(problem)
     assert result.validation is None
-    poses = poses_of(problem, result)
+    poses = poses_of(result)
     assert set(poses.role) == {'fitted'}
     assert poses.judged.any()
 
 
 def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
-    problem, result = solved
-    poses = poses_of(problem, result)
+    _, result = solved
+    poses = poses_of(result)
     monkeypatch.setattr('calib_ros.report.explorer.SINGLE', 30)
     shown = explorer(result.chain, poses)
     good = ~poses.outlier
@@ -289,7 +289,7 @@ def test_half_a_million_poses_make_a_page_of_eight_megabytes(solved):
     _, result = solved
     count = 500_000
     rng = np.random.default_rng(0)
-    one = poses_of(*solved)
+    one = poses_of(solved[1])
     many = one.select(rng.integers(0, len(one), count))
     many = replace(many, stamps_ns=np.arange(count), after=rng.normal(0, 1e-4, (count, 3)))
     shown = explorer(result.chain, many)
@@ -325,7 +325,7 @@ def packed(text):
 
 def test_the_arrays_of_a_page_are_the_poses(solved):
     problem, result = solved
-    poses = poses_of(problem, result)
+    poses = poses_of(result)
     arrays = page_of(report_of(problem, result)).data['explorer']['arrays']
     assert packed(arrays['after']).reshape(-1, 3) == pytest.approx(1e3 * poses.after, rel=1e-6)
     assert packed(arrays['joints']).reshape(-1, 6) == pytest.approx(poses.joints, rel=1e-6)
@@ -342,7 +342,7 @@ def test_poses_and_measurements_are_two_counts(solved):
     assert [each for each in lines if each.startswith('- Poses')] == [f'- Poses: {TRAIN + TEST}']
     assert f'- poses fitted: {TRAIN}' in lines
     assert f'- measurements: {3 * TRAIN}' in lines
-    poses = replace(poses_of(*solved), stamps_ns=10**18 * np.array([1, 8]))
+    poses = replace(poses_of(solved[1]), stamps_ns=10**18 * np.array([1, 8]))
     said = dict(identity_of(UR, Origin(), poses))['Measured, by the stamps']
     assert said.startswith('2001-09-09 01:46 to 2223-07-06 14:13 UTC (in the future')
     assert not any('foreign' in each or 'not used' in each for each in lines[-20:])
@@ -351,7 +351,7 @@ def test_poses_and_measurements_are_two_counts(solved):
 def test_held_out_poses_that_were_fitted_too_are_in_no_figure(solved):
     problem, result = solved
     validation = replace(result.validation, repeated=np.arange(TEST) < 3)
-    poses = poses_of(problem, replace(result, validation=validation))
+    poses = poses_of(replace(result, validation=validation))
     after = 1e3 * np.linalg.norm(poses.after[poses.judged], axis=1)
     assert validation.figures[1].rms_mm == pytest.approx(np.sqrt(np.mean(after**2)))
     assert validation.figures[1].count == len(after) < result.validation.figures[1].count

@@ -19,7 +19,7 @@ def test_distances_and_outliers_have_pages():
     shifted[7] += 0.02
     problem = Problem(UR, replace(rows, positions=shifted), more=(wire,))
     result = identify(problem)
-    poses = poses_of(problem, result)
+    poses = poses_of(result)
     assert len(poses) == 160
     assert poses.outlier.sum() == len(result.outliers) > 0
     page = page_of(report_of(problem, result))
