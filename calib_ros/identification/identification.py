@@ -21,7 +21,7 @@ from calib_ros.decision.acceptance import oddities, refusals
 from calib_ros.decision.comparison import compare
 from calib_ros.decision.delays import timed
 from calib_ros.decision.drift import chance_of_gain
-from calib_ros.decision.misfits import arms_own, coupling_share, outliers_of
+from calib_ros.decision.misfits import arms_own, coupling_share, frozen_joints, outliers_of
 from calib_ros.decision.region import Region
 from calib_ros.decision.result import Identification
 from calib_ros.decision.risk import region_of
@@ -108,8 +108,8 @@ def _identified(
     uncertainty = replace(uncertainty, parts=wider**2 * uncertainty.parts)
     parameters = parameter_rows(fitted, uncertainty)
     region, scaled = _region(inference, posterior, wider)
-    wrong, corrected = wrong_distances(fitted)
-    step = find_step(corrected) if corrected else None
+    (wrong, corrected), stuck = wrong_distances(fitted), frozen_joints(fitted)
+    step = find_step(corrected) if corrected and not stuck else None
     result = Identification(
         chain=chain,
         before=before.chain,
@@ -133,7 +133,7 @@ def _identified(
         region=region,
         weak=_weak(problem, parameters),
         step=step,
-        remarks=oddities(problem, posterior, step, coarse),
+        remarks=(*stuck, *oddities(problem, posterior, step, coarse)),
         coupled=by_couplings > 0.0,
         surprise=surprise,
         strain=strain,

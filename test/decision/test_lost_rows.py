@@ -7,16 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, UR10E, arm, measured_arm
+from fits import NOISE, SCARA, SIGMAS, UR10E, arm, measured_arm
 from scipy.spatial.transform import Rotation
 
 from calib_ros import Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.decision import lost_rows, orders
 from calib_ros.decision.lost_rows import _sides_differ, _where, row_loss
+from calib_ros.decision.misfits import frozen_joints
 from calib_ros.decision.mistakes import diagnose
+from calib_ros.estimation import fitting
 from calib_ros.estimation.levels import LEAST_ASIDE
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.se3 import exp_rotation
 
 
 @pytest.mark.parametrize(
@@ -182,6 +185,44 @@ def test_a_source_that_repeats_its_last_value_is_named(part, rows_of):
     of_messages = rows_of.startswith('poses')  # of a simulation, stamps in whole seconds
     said = str(diagnose(Problem(UR10E, replace(seen, **held), of_messages=of_messages)))
     assert f'the {part} repeated in {rows_of} while the rest moved' in said
+
+
+@pytest.mark.parametrize(
+    ('chain', 'joint', 'oriented', 'of_messages'),
+    [(UR10E, 2, True, False), (UR10E, 2, False, True), (SCARA, 2, True, False)],
+)
+def test_a_joint_that_repeats_its_value_while_others_move_is_named(
+    chain, joint, oriented, of_messages
+):
+    """Its rows were gross errors without a cause, or a device that moved."""
+    *_, seen = measured_arm(1, 40, chain=chain, oriented=oriented)
+    joints = seen.joints.copy()
+    joints[12:18, joint] = joints[12, joint]
+    problem = Problem(chain, replace(seen, joints=joints), of_messages=of_messages, **SIGMAS)
+    (told,) = frozen_joints(fitting.fit(problem))
+    where = 'poses of 14.000 s to 18.000 s' if of_messages else 'lines 14 to 18'
+    assert told.startswith(f'{chain.joint_names[joint]} moved in {where}, but its values repeat')
+    assert identify(problem).remarks[0] == told
+
+
+@pytest.mark.parametrize('part', ['target', 'base', 'slip', 'gross errors'])
+def test_joints_that_rest_are_not_frozen_whatever_else_is_wrong(part):
+    """Of the second half, of the wrist alone; a base that turns moves it as the first joint."""
+    rng, true = np.random.default_rng(5), arm(5)
+    q = UR10E.random_joints(80, rng)
+    q[50:, :3] = q[50, :3]
+    moved = np.zeros(6)
+    moved[1] = 0.05 * (part == 'slip')
+    seen = measure(true, q + moved * (np.arange(80) >= 60)[:, np.newaxis], rng, *NOISE, False)
+    if part == 'target':
+        seen.positions[60:] += 0.02 * true.forward(q[60:])[:, :3, 0]
+    if part == 'base':
+        seen.positions[60:] = seen.positions[60:] @ exp_rotation(np.array([[0.0, 0.0, 0.1]]))[0]
+    if part == 'gross errors':
+        seen.positions[55::3] += rng.normal(scale=0.05, size=(9, 3))
+    fitted = fitting.fit(Problem(UR10E, replace(seen, joints=q), **SIGMAS))
+    assert fitted.robust.outliers.sum() > 5
+    assert frozen_joints(fitted) == ()
 
 
 @pytest.mark.parametrize('size', [1e3, 1e-3])
