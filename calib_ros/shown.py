@@ -37,6 +37,11 @@ def rounded(value: float, sign: str = '') -> str:
     return f'{value:{sign}.{max(3, digits)}f}'
 
 
+def two_digits(value: float) -> str:
+    """Return mm, mrad or ms with two digits, of large ones without a power of ten: 8.4, 150."""
+    return f'{float(f"{value:.2g}"):g}'
+
+
 def sentence(text: str) -> str:
     """Return a text with its capital letter and full stop, unless it has an end of its own."""
     return f'{capitalised(text)}{"" if text.endswith((".", "?")) else "."}'

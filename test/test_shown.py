@@ -23,7 +23,7 @@ from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.report.words import interval_mm
-from calib_ros.shown import Shown, moment, rounded, rows_in_words
+from calib_ros.shown import Shown, moment, rounded, rows_in_words, two_digits
 
 CHAIN = calib_ros.load_chain('ur10e')
 JOINTS = CHAIN.random_joints(200, np.random.default_rng(1))
@@ -278,6 +278,10 @@ def test_numbers_have_the_digits_that_a_reader_needs(value, text):
     assert rounded(-value).lstrip('-') == text
     assert rounded(value, '+') == f'+{text}'
     assert interval_mm(value, value) == f'{text} to {text}'
+
+
+def test_two_digits_have_no_power_of_ten():
+    assert [*map(two_digits, (0.8412, 8.412, 151.0))] == ['0.84', '8.4', '150']
 
 
 def test_a_notebook_shows_the_verdict_and_its_reasons():

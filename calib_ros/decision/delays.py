@@ -36,6 +36,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import DELAY, Parameter
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXCEPTION, Settings
+from calib_ros.shown import two_digits
 
 
 def timed(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
@@ -45,7 +46,7 @@ def timed(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
     velocity count for less.
     """
     told = list[str]()
-    remedy = 'Stamp all with one clock when they are taken, or stop at each pose (mode dwell)'
+    remedy = 'Stamp everything as it is measured, by one clock, or stop at each pose (mode dwell)'
     for base in sorted({each.base for each in problem.sets if _in_motion(each)}):
         try:
             steady, change = _without_drift(problem, Parameter(base, DELAY))
@@ -54,14 +55,14 @@ def timed(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
             break
         if change:
             told.append(
-                f'{base}.delay changes by {1e3 * change:.2g} ms over the session, which is taken '
-                f'into account: clocks drift apart or jump. {remedy}'
+                f'{base}.delay changes by {two_digits(1e3 * change)} ms over the session: clocks '
+                f'drift apart or jump. Joint values are corrected for it. {remedy}'
             )
         if jitter:
             told.append(
-                f'measurements of {base} are early or late by {1e3 * jitter:.2g} ms at random: '
-                'stamps jitter, or the device or the joint states are smoothed. Errors along the '
-                f'motion count for less. {remedy}'
+                f'measurements of {base} are early or late by {two_digits(1e3 * jitter)} ms at '
+                'random: stamps jitter, or the device or the joint states are smoothed. Errors '
+                f'along the motion count for less. {remedy}'
             )
     return problem, tuple(told)
 
@@ -233,10 +234,10 @@ def unsteady(problem: Problem, result: Identification) -> tuple[str, bool]:
     slight = before.rms_mm < ALIKE * after.rms_mm and lacking.turns > typical / NEARER
     unit = ' or '.join(sorted({f'm{joint.driven.unit}' for joint in problem.chain.joints}))
     text = (
-        f'joints seem off by {1e3 * lacking.turns:.2g} {unit} at random, from pose to pose: the '
-        'arm moved while it was measured, joint values and poses are not of one moment, values '
-        'lack digits, joints have play, or devices or targets lack names. Stop at each pose, '
-        'and compare the clocks'
+        f'joints seem off by {two_digits(1e3 * lacking.turns)} {unit} at random, from pose to '
+        'pose: the arm moved while it was measured, joint values and poses are not of one moment, '
+        'values lack digits, joints have play, or devices or targets lack names. Stop at each '
+        'pose, and compare the clocks'
     )
     return text, bool(result.refusals) or slight
 

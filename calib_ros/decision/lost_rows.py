@@ -32,7 +32,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.settings import EXCEPTION
-from calib_ros.shown import rows_in_words
+from calib_ros.shown import rows_in_words, two_digits
 
 SLIPS = (0, 1, -1, 2, -2)  # rows that may be missing (benchmarks/mistakes.py loses one)
 FEWEST_ROWS = 3 * IN_A_FRAME
@@ -139,9 +139,10 @@ def computed_rows(problem: Problem) -> str:
         if found[0].error < EXCEPTION**2 * found[1].error:
             away = sample_errors(found[0].chain, alone, flange(found[0].chain, alone))
             near = np.flatnonzero(away < EXCEPTION * found[1].error).tolist()
+            ours, others = (two_digits(1e3 * each.error) for each in found[:2])
             return (
                 f'{rows_in_words(near, seen.stamps_ns, problem.of_messages)} fit the uncorrected '
-                f'arm to {1e3 * found[0].error:.2g} mm, others to {1e3 * found[1].error:.2g} mm: '
+                f'arm to {ours} mm, others to {others} mm: '
                 'are these nominal poses, computed and not measured? Leave them out'
             )
     return ''

@@ -30,7 +30,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray, norms
 from calib_ros.settings import EXCEPTION
-from calib_ros.shown import rows_in_words
+from calib_ros.shown import rows_in_words, two_digits
 
 ADVICE = (
     'device errors do not depend on joint values, so the arm has an effect that the model lacks. '
@@ -160,10 +160,10 @@ def loose_target(sets: Sequence[Observations]) -> str:
     (name, often), *_ = Counter(tool for pair in wide for tool in pair[:2]).most_common()
     widest = max(wide, key=lambda pair: wide[pair])
     which = name if often == len(wide) > 1 else f'{widest[0]} or {widest[1]}'
-    far, usual = (1e3 * np.sqrt(each) for each in (max(wide.values()), least))
+    far, usual = (two_digits(1e3 * np.sqrt(each)) for each in (max(wide.values()), least))
     return (
         f'the target {which} is loose, or badly seen from some sides: its distance from another '
-        f'varies by {far:.2g} mm (RMS), {usual:.2g} mm is usual. Fasten it, or leave it out'
+        f'varies by {far} mm (RMS), {usual} mm is usual. Fasten it, or leave it out'
     )
 
 

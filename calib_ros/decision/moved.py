@@ -12,7 +12,7 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.settings import Settings
-from calib_ros.shown import are_lines, moment, rows_in_words
+from calib_ros.shown import are_lines, moment, rows_in_words, two_digits
 
 ZERO = 'zero'  # of the distances of a device
 FRAMES = ('base', 'tool')
@@ -87,7 +87,7 @@ class Step:
         size = size if self.later else abs(size)
         if self.unit == 'rad' and abs(size) > Settings.largest_angle:
             return f'by {math.degrees(size):.0f}°'
-        return f'by {float(f"{1e3 * size:.2g}"):g} m{self.unit}'
+        return f'by {two_digits(1e3 * size)} m{self.unit}'
 
     @property
     def _where(self) -> str:

@@ -41,7 +41,7 @@ from calib_ros.kinematics.inverse import Aim
 from calib_ros.kinematics.parameter import DELAY, IN_A_FRAME, LENS_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXACT, EXCEPTION, LEVER, Settings
-from calib_ros.shown import some
+from calib_ros.shown import some, two_digits
 
 LEAST_NOISE = NEARER * EXCEPTION
 """Residuals in units of the given sigmas below which these are wrong: clearly less than a
@@ -174,7 +174,7 @@ def _level_hand(problem: Problem, result: Identification) -> str:
     there = [f'{n}, taken as {round(result.chain.value(n), 3) + 0.0:g}' for n in sorted(hidden)]
     return (
         f'a hand that stays level hides {", and ".join(there)}, but tilts by errors of the arm: '
-        f'tool points {LEVER:g} m from there are {1e3 * off:.2g} mm off. Give '
+        f'tool points {LEVER:g} m from there are {two_digits(1e3 * off)} mm off. Give '
         f'{min(hidden).owner} in the chain file, to a centimetre'
     )
 
