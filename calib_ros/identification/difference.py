@@ -95,11 +95,10 @@ class Difference(Shown):
 
     def _question(self) -> str:
         first = [reason for reason, *_ in self.changed]
-        names = [name for reason in first for name in reason.names]
+        zeros = [each for each in first if [n.kind for n in each.names] in (['theta'], ['d'])]
         if all(reason.owner == changes.LOAD for reason in first):
             return 'does it carry another one?'
-        zeros = len(names) >= SEVERAL and {name.kind for name in names} == {'theta'}
-        if zeros or 'all joints' in {reason.owner for reason in first}:
+        if len(zeros) >= SEVERAL or 'all joints' in {reason.owner for reason in first}:
             return 'was it mastered again, or bumped?'
         return 'was it bumped?'
 

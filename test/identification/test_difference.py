@@ -17,6 +17,7 @@ from calib_ros import Calibration, Observations, Problem, difference, identify, 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.changes import (
     ChangeColumns,
+    Explanation,
     Information,
     gauge_map,
     reason_in_words,
@@ -25,7 +26,7 @@ from calib_ros.decision.changes import (
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import SEVERAL
 from calib_ros.identification.age import drift_of
-from calib_ros.identification.difference import _chance, _change
+from calib_ros.identification.difference import Difference, _chance, _change
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 
 UR10 = DATA / 'ur10_ipa_leica'
@@ -167,6 +168,17 @@ def test_a_warmer_arm_is_told_and_hides_no_bump(nights, scale):
     told = [[e.names for e in reasons] for reasons in bumped.changed]
     assert sorted(told) == [[('device.ratio',)], [('elbow_joint.theta',)]]
     assert 'was it bumped?' in bumped.in_words()
+
+
+@pytest.mark.parametrize(
+    ('zeros', 'mastered'),
+    [('a.theta b.theta c.theta', True), ('axis.d a.theta b.theta', True), ('a.d b.a', False)],
+)
+def test_three_zeros_were_mastered_again_that_of_a_linear_joint_too(zeros, mastered):
+    names, size = map(Parameter, zeros.split()), np.ones(1)
+    changed = tuple((Explanation(n.owner, (n,), 9.0, 0.0, 1.0, size, size),) for n in names)
+    found = Difference((), size[:0], size[:0], 0.0, 0.0, 1e-3, 2e-3, 1e-3, changed, 1.0)
+    assert ('was it mastered again, or bumped?' in found.in_words()) == mastered
 
 
 @pytest.mark.parametrize('fixed', [(), UR.parameter_names[12:]])
