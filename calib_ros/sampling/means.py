@@ -52,11 +52,16 @@ def averages(values: FloatArray, begins: Index, sigmas: FloatArray) -> Means:
         settled &= ~spikes
     means = mean_of_each(values, begins, used)
     squares = (values - np.repeat(means, ends - begins, axis=0)) ** 2
-    spreads = np.sqrt(mean_of_each(squares, begins, used).mean(axis=1))
-    doubled = (ends - begins >= TELLING) & (spreads > MOST_SPREAD * sigmas)
+    spreads, wide = (
+        np.sqrt(mean_of_each(squares, begins, which).mean(axis=1))
+        for which in (used, np.ones_like(used))
+    )
+    doubled = (ends - begins >= TELLING) & (wide > MOST_SPREAD * sigmas)
     for k in np.flatnonzero(doubled).tolist():
         part = slice(begins[k], ends[k])
-        doubled[k] = _in_heaps(values[part][used[part]])
+        plain = spreads[k] > MOST_SPREAD * sigmas[k] and _in_heaps(values[part][used[part]])
+        doubled[k] = plain or _in_heaps(values[part])  # the rarer one may seem to be spikes
+        spreads[k] = spreads[k] if plain or not doubled[k] else wide[k]
     return Means(used, rests & (spreads <= limits), means, spreads, doubled)
 
 
@@ -78,17 +83,21 @@ def _noise(values: FloatArray) -> float:
 
 
 def _in_heaps(values: FloatArray) -> bool:
-    """Tell whether values (N, w) lie in two heaps or more, ten times their size apart.
+    """Tell whether values (N, w) lie in heaps by turns, ten times their size apart.
 
     No noise does: of two parts Gaussian noise leaves 36 % of the variance within them, a swing
-    19 %, heaps 4 %; of more parts each leaves less.
+    19 %, heaps 4 %; of more parts each leaves less. A target that settles comes to each once.
     """
     away = values - values.mean(axis=0)
-    along = np.sort(away @ np.linalg.svd(away, full_matrices=False)[2][0])
-    heaps = np.split(along, 1 + np.flatnonzero(np.diff(along) > 0.5 * along.std()))
-    within = sum(((heap - heap.mean()) ** 2).sum() for heap in heaps)
-    most = 2.0 * EXCEPTION * (along**2).sum() / len(heaps) ** 2
-    return bool(FEW * len(heaps) <= len(along) and within < most)
+    along = away @ np.linalg.svd(away, full_matrices=False)[2][0]
+    order = np.argsort(along)
+    heap = np.zeros(len(along), dtype=int)
+    heap[order[1:]] = np.cumsum(np.diff(along[order]) > 0.5 * along.std())
+    counts = np.bincount(heap)
+    within = along @ along - (np.bincount(heap, along) ** 2 / counts).sum()
+    most = 2.0 * EXCEPTION * (along @ along) / len(counts) ** 2
+    turns = np.count_nonzero(np.diff(heap)) > 1
+    return bool(counts.min() >= FEW and within < most and turns)
 
 
 def _settled(values: FloatArray, reach: float) -> int:

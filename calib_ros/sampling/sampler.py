@@ -88,9 +88,9 @@ class Sampler:
         each = (begins, counts, numbers[begins], times, spikes, means.rests, means.spreads)
         for k, row in enumerate(zip(*(part.tolist() for part in each), strict=True)):
             begin, count, number, stamp_ns, left_out, rests, spread = row
-            if rests and means.doubled[k]:
+            if means.doubled[k]:
                 self.doubled.append(spread)
-                rests = spread <= Settings.largest_error  # else the mean is far from each
+                rests &= spread <= Settings.largest_error  # else the mean is far from each
             if left_out or not rests:
                 self._shaken = min(self._shaken, number)
             if not rests:

@@ -45,21 +45,22 @@ def test_measurements_of_two_places_are_told(spread, size, told):
 
 
 @pytest.mark.parametrize(
-    ('apart', 'noise', 'count', 'told'),
+    ('apart', 'noise', 'count', 'burst', 'told'),
     [
-        *[(1e-3, 0.0, 15, '0.3'), (2e-2, 1e-3, 15, '5.8'), (0.3, 0.0, 6, '87')],
-        *[(1e-4, 0.0, 15, ''), (2e-3, 5e-4, 15, '')],
+        *[(1e-3, 0.0, 15, 1, '0.3'), (2e-2, 1e-3, 15, 1, '5.8'), (0.3, 0.0, 6, 1, '87')],
+        *[(1e-4, 0.0, 15, 1, ''), (2e-3, 5e-4, 15, 1, '')],
+        *[(0.3, 0.0, 15, 5, '120'), (0.3, 0.0, 15, 8, '120')],
     ],
 )
-def test_two_devices_are_told_by_their_turns(apart, noise, count, told):
-    """Close together they were averaged and accepted; far apart they were stops that shake."""
+def test_two_devices_are_told_by_their_turns(apart, noise, count, burst, told):
+    """Close together they were averaged and accepted; far apart or in bursts, stops that shake."""
     made, rng, turns = CalibrationSession(UR5E), np.random.default_rng(7), itertools.count()
     *source, seen = tracker()
 
     def message(stamp, row):
         found = seen(stamp, row)
         where, shift = found.pose.position, rng.normal(scale=noise, size=3)
-        second = next(turns) % 2 and stamp < START + round(1.6e9 * count)
+        second = next(turns) // burst % 2 and stamp < START + round(1.6e9 * count)
         where.x, where.y = where.x + shift[0], where.y + shift[1]
         where.z += shift[2] + second * apart
         return found

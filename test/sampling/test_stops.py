@@ -190,8 +190,12 @@ def test_the_limit_of_the_spread_is_beyond_chance(rng):
 
 @pytest.mark.parametrize('places', [2, 3])
 def test_several_places_are_told_of_their_own_stop(rng, places):
-    """Of three noisy stops, a metre apart, the last is measured in places by turns."""
+    """Of three noisy stops, a metre apart, the last is measured in places by turns.
+
+    In the second the target changes its place once.
+    """
     values = rng.normal(scale=1e-3, size=(180, 3)) + np.repeat(np.eye(3), 60, axis=0)
+    values[90:120, 2] += 0.1
     values[120:, 2] += 0.1 * (np.arange(60) % places)
     found = averages(values, np.array([0, 60, 120]), np.full(3, 1e-4))
     assert found.doubled.tolist() == [False, False, True]
