@@ -147,8 +147,8 @@ class Collector:
         if not self.holding:
             self._round(self._complete_ns, rounds)
 
-    def hints(self, measurements: int) -> list[Hint]:
-        """Return what looks wrong with the joint states, given the number of measurements."""
+    def hints(self, measurements: int, names: Sequence[str]) -> list[Hint]:
+        """Return what looks wrong with the states of joints, given the number of measurements."""
         between = self.dropped[Cause(POSES, APART)]
         shared = self.dropped[Cause(JOINTS, CONTRARY)]
         found = sparse(between, measurements, self.settings.max_gap, shared)
@@ -157,7 +157,9 @@ class Collector:
             return [*found, by_turns(self.rests.swing)]
         if found or needed is None:  # of too rare joint states the noise is not known
             return found
-        return [restless(needed, self.settings.still)]
+        most, every = self.track.noisiest.most_common(1), self.track.noisiest.total()
+        one = ''.join(f', above all {names[k]}' for k, often in most if 2 * often > every)
+        return [restless(needed, self.settings.still, one)]
 
     def clock_hints(self) -> list[Hint]:
         """Report clocks that differ or differed by too much, or joint states that have ended."""

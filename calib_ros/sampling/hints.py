@@ -39,7 +39,7 @@ def unheard(received: Mapping[str, int]) -> list[Hint]:
     return [Hint('no measurements received: check sources', f'{words} in sources?')]
 
 
-def restless(needed: float, still: float) -> Hint:
+def restless(needed: float, still: float, above_all: str) -> Hint:
     """Report joints at rest that hardly ever stay within `still`; `needed` is in rad or m.
 
     Beyond the distance of configurations this is no encoder noise: two arms publish.
@@ -48,8 +48,8 @@ def restless(needed: float, still: float) -> Hint:
         return by_turns(needed)
     return Hint(
         f'joints hardly ever rest within still: set still to {needed:.2g}',
-        f'the joints hardly ever rest within still ({still:g}), though the arm is at rest: their '
-        f'values are noisy; set still to {needed:.2g}, 6 x their noise',
+        f'the joints hardly ever rest within still ({still:g}){above_all}, though the arm is at '
+        f'rest: their values are noisy; set still to {needed:.2g}, 6 x their noise',
     )
 
 

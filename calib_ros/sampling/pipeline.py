@@ -38,6 +38,7 @@ class Pipeline:
         # to `max_gap` apart belong together
         self.gate = Gate(max(settings.lateness + settings.max_gap, Settings.lateness))
         self._delay_ns = round(settings.delay * 1e9)
+        self._names = chain.joint_names
         self._newest = {JOINTS: 0, POSES: 0}
 
     def take(self, pieces: Sequence[Piece]) -> None:
@@ -66,7 +67,7 @@ class Pipeline:
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the stamps, given the number of measurements."""
         found = self.collector.clock_hints() or self.clocks.hints()
-        return found + self.clocks.stuck() + self.collector.hints(measurements)
+        return found + self.clocks.stuck() + self.collector.hints(measurements, self._names)
 
     def unsettled(self) -> list[Hint]:
         """Return what looks wrong with measurements at stops, if no stamps explain it."""

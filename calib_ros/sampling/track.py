@@ -8,6 +8,7 @@ of the joints; each part is interpolated on its own.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, TypeAlias
 
@@ -50,6 +51,7 @@ class Track:
         self._parts: dict[tuple[int, ...], Rows] = {}
         self._earlier = np.zeros(len(revolute))  # signs of last moves before the samples
         self.horizon_ns = 0  # samples before this stamp have been dropped
+        self.noisiest = Counter[int]()  # how often each joint had most noise at rest
 
     @property
     def newest_ns(self) -> int:
@@ -173,7 +175,7 @@ class Track:
         From second differences of the samples of some time before a stamp, free of motion (von
         Neumann 1941). None with too few samples, or more spread than that: the arm moves.
         """
-        largest = None
+        found = np.zeros(len(self._revolute))
         for columns, rows in self._parts.items():
             (first,), (end,) = self._bounds(rows, time_ns, np.array([newest_ns]))
             if end - first < TELLING:
@@ -182,8 +184,9 @@ class Track:
             noise = np.sqrt((np.diff(values, 2, axis=0) ** 2).mean(axis=0) / 6.0)
             if (values.std(axis=0) > MOST_SPREAD * noise).any():
                 return None
-            largest = max(largest or 0.0, float(noise.max()))
-        return largest
+            found[list(columns)] = noise
+        self.noisiest[int(found.argmax())] += 1
+        return float(found.max()) if self._parts else None
 
     def swings_at_rest(self, time_ns: int, rounds: Sequence[int]) -> list[float | None]:
         """Return by how much [rad or m] joints jump to and fro with each sample, or zero.

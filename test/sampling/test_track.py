@@ -307,6 +307,7 @@ def test_the_noise_of_a_joint_at_rest_is_that_of_its_newest_samples():
     assert made.noise_at_rest(10 * MS, 3990 * MS) == pytest.approx(1e-5, rel=0.8)  # of a few
     assert made.noise_at_rest(1500 * MS, 60 * MS) is None  # too few there are
     assert made.noise_at_rest(1500 * MS, 70 * MS) == pytest.approx(1e-3, rel=0.8)
+    assert made.noisiest == {1: 4}
 
 
 def test_a_joint_that_moves_tells_no_noise():
