@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import groupby
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
 from calib_ros.estimation.samples import Samples
-from calib_ros.estimation.start import closed_forms, flange, free_in
+from calib_ros.estimation.start import closed_frames, flange, free_in
 from calib_ros.estimation.system import System
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -65,43 +66,46 @@ def trial_of(chain: Chain, sets: Sets) -> Trial:
 def trials_of(tried: Iterable[tuple[Chain, Sets]]) -> list[Trial]:
     """Return what `trial_of` returns of each chain and its samples.
 
-    Samples of one chain that are as many and of one kind are computed at once.
+    Samples that are as many, of one kind and in the same frames are computed at once.
     """
     tried, alike = [*tried], dict[tuple[object, ...], list[int]]()
     for number, (chain, sets) in enumerate(tried):
-        kind = (id(chain), *((len(e), e.seen, e.base, e.tool) for e in sets))
-        alike.setdefault(kind, []).append(number)
+        ends = [(e, chain.all_frames.get(e.base), chain.all_frames.get(e.tool)) for e in sets]
+        kind = ((len(e), e.seen, e.base, e.tool, id(base), id(tool)) for e, base, tool in ends)
+        alike.setdefault((*kind,), []).append(number)
     found: dict[int, Trial] = {}
     for numbers in alike.values():
-        chain, sets = tried[numbers[0]]
-        most = max(1, 4 * BLOCK // max(map(len, sets)))
+        most = max(1, 4 * BLOCK // max(map(len, tried[numbers[0]][1])))
         for first in range(0, len(numbers), most):
             some = numbers[first : first + most]
-            found |= zip(some, _at_once(chain, [tried[k][1] for k in some]), strict=True)
+            found |= zip(some, _at_once([tried[k] for k in some]), strict=True)
     return [found[number] for number in range(len(tried))]
 
 
-def _at_once(chain: Chain, samples: Sequence[Sets]) -> Iterator[Trial]:
-    """Yield the trials of a chain with each of the samples: C times as many of one kind."""
-    placed, spreads, seen = chain, list[FloatArray](), list[tuple[Observations, FloatArray]]()
+def _at_once(tried: Sequence[tuple[Chain, Sets]]) -> Iterator[Trial]:
+    """Yield the trials of chains in the same frames with C times as many samples of one kind."""
+    chains, samples = zip(*tried, strict=True)
+    found, spreads, seen = chains[0], list[FloatArray](), list[tuple[Observations, FloatArray]]()
     for every in zip(*samples, strict=True):
         one = every[0]
         names = ('joints', 'positions', 'rotations', 'oriented', *('points',) * one.seen)
         each = one.changed(**{name: np.array([getattr(e, name) for e in every]) for name in names})
-        arm = flange(chain, each)
-        known = placed.all_frames  # other robots have only a base and a tool
-        alone = replace(chain, base=known.get(one.base), tool=known.get(one.tool))
-        alone = _nearest(alone, each.changed(base='base', tool='tool'), arm)
-        placed = placed.with_frame(one.base, alone.frame('base'))
-        placed = placed.with_frame(one.tool, alone.frame('tool'))
+        alike = [[*run] for _, run in groupby(range(len(every)), lambda k: id(chains[k]))]
+        runs = ((chains[run[0]], each.changed(joints=each.joints[run])) for run in alike)
+        arm = np.concatenate([flange(*run) for run in runs])
+        known = found.all_frames  # other robots have only a base and a tool
+        alone = replace(found, base=known.get(one.base), tool=known.get(one.tool))
+        base, tool = _nearest(alone, each.changed(base='base', tool='tool'), arm)
+        found = found.with_frame(one.base, replace(alone.frame('base'), matrix=base))
+        found = found.with_frame(one.tool, replace(alone.frame('tool'), matrix=tool))
         places = arm[..., :3, 3], each.positions
         measured = places[: 1 if one.socket or one.seen else 2]  # a socket measures nothing
         spreads.append(np.min([np.sqrt(e.var(axis=1).sum(axis=1)) for e in measured], axis=0))
         seen.append((each, arm))
-    errors = _usual(np.concatenate([sample_errors(placed, *each) for each in seen], axis=1))
+    errors = _usual(np.concatenate([sample_errors(found, *each) for each in seen], axis=1))
     spread = np.median(spreads, axis=0)
-    frames = {name: placed.frame(name) for each, _ in seen for name in (each.base, each.tool)}
-    for k, sets in enumerate(samples):
+    frames = {name: found.frame(name) for each, _ in seen for name in (each.base, each.tool)}
+    for k, (chain, sets) in enumerate(tried):
         for name, frame in frames.items():
             chain = chain.with_frame(name, replace(frame, matrix=frame.matrix[k]))
         trial = Trial(chain, sets, tuple(arm[k] for _, arm in seen), float(spread[k]))
@@ -109,32 +113,26 @@ def _at_once(chain: Chain, samples: Sequence[Sets]) -> Iterator[Trial]:
         yield trial
 
 
-def _nearest(chain: Chain, each: Observations, arm: FloatArray) -> Chain:
-    """Return the chain in the closed forms (C, 4, 4) nearest to samples (C, N).
+def _nearest(chain: Chain, each: Observations, arm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return base and tool (C, 4, 4) of the closed forms nearest to samples (C, N).
 
     `arm` (C, N, 4, 4) are the poses of the bare arm.
     """
-    best, away = _best_of([*closed_forms(chain, each, arm)], each, arm)
-    usual = _last(away) + 1
-    if usual < 2 * IN_A_FRAME:  # base and tool explain as few
-        return best
-    rows = np.arange(len(arm))[:, np.newaxis], np.argsort(away, axis=1)[:, :usual]
-    names = ('positions', 'rotations', 'oriented', *('points',) * each.seen)
-    few = each.changed(**{name: getattr(each, name)[rows] for name in names})
-    # a gross error would hide a mistake
-    return _best_of([best, *closed_forms(chain, few, arm[rows])], each, arm)[0]
-
-
-def _best_of(
-    starts: Sequence[Chain], each: Observations, arm: FloatArray
-) -> tuple[Chain, FloatArray]:
-    """Return the frames (C, 4, 4) that are best for C samples, as a chain, and errors (C, N)."""
-    sizes = np.array([sample_errors(start, each, arm) for start in starts])
-    best, found = (_usual(sizes).argmin(axis=0), np.arange(len(arm))), starts[0]
-    for end in ('base', 'tool'):
-        every = [np.broadcast_to(one.frame(end).matrix, (len(arm), 4, 4)) for one in starts]
-        found = found.with_frame(end, replace(found.frame(end), matrix=np.array(every)[best]))
-    return found, sizes[best]
+    forms = closed_frames(chain, each, arm)
+    sizes = _errors(forms, each, arm)
+    best = _usual(sizes).argmin(axis=0), np.arange(len(arm))
+    usual = _last(sizes) + 1
+    if usual >= 2 * IN_A_FRAME:  # base and tool explain fewer
+        rows = best[1][:, np.newaxis], np.argsort(sizes[best], axis=1)[:, :usual]
+        names = ('positions', 'rotations', 'oriented', *('points',) * each.seen)
+        few = each.changed(**{name: getattr(each, name)[rows] for name in names})
+        # a gross error would hide a mistake
+        more = closed_frames(chain, few, arm[rows])
+        sizes = np.concatenate([sizes, _errors(more, each, arm)])
+        forms = np.concatenate([forms, more], axis=1)
+        best = _usual(sizes).argmin(axis=0), best[1]
+    base, tool = forms
+    return base[best], tool[best]
 
 
 def _last(sizes: FloatArray) -> int:
@@ -244,8 +242,15 @@ def refine_trial(problem: Problem, trial: Trial) -> Trial:
 
 def sample_errors(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
     """Return the errors (..., N) [m] of samples, given poses (..., N, 4, 4) of the bare arm."""
-    base, tool = chain.frame(each.base).matrix, chain.frame(each.tool).matrix
-    found = (arm.reshape(*arm.shape[:-3], -1, 4) @ tool).reshape(arm.shape)
+    ends = chain.frame(each.base).matrix, chain.frame(each.tool).matrix
+    return _errors(ends, each, arm)
+
+
+def _errors(ends: Iterable[FloatArray], each: Observations, arm: FloatArray) -> FloatArray:
+    """Return what `sample_errors` does, given base and tool (..., 4, 4)."""
+    base, tool = ends
+    found = arm.reshape(*arm.shape[:-3], -1, 4) @ tool
+    found = found.reshape(*found.shape[:-2], -1, 4, 4)
     places = found[..., :3, 3]
     if each.points is not None:  # seen
         places = places + np.einsum('...nij,...nj->...ni', found[..., :3, :3], each.points)
@@ -254,7 +259,7 @@ def sample_errors(chain: Chain, each: Observations, arm: FloatArray) -> FloatArr
     away = np.sqrt(np.einsum('...nj,...nj->...n', left, left))
     if each.oriented.any():
         seen = np.swapaxes(each.rotations, -1, -2)
-        back = (seen.reshape(*seen.shape[:-3], -1, 3) @ turn).reshape(found[..., :3, :3].shape)
+        back = (seen.reshape(*seen.shape[:-3], -1, 3) @ turn).reshape(*away.shape, 3, 3)
         turned = se3.angles_between(back, np.swapaxes(found[..., :3, :3], -1, -2))
         away = away + LEVER * np.where(each.oriented, turned, 0.0)
     return np.asarray(away)

@@ -165,9 +165,9 @@ def _starts(chain: Chain, observations: Observations) -> Iterator[Iterator[Chain
     if observations.plane:
         yield _on_plane(chain, arm, observations)
         return
-    yield closed_forms(chain, observations, arm)
+    yield _each(chain, closed_frames(chain, observations, arm))
     cube = Rotation.create_group('O').as_matrix()
-    yield (_complete(chain, arm, observations, rotation) for rotation in cube)
+    yield _each(chain, _complete(chain, arm, observations, cube))
 
 
 def flange(chain: Chain, observations: Observations) -> FloatArray:
@@ -205,17 +205,25 @@ def fit_to_arm(
     return fitted, float(np.sqrt((left**2).sum(axis=1).mean()))
 
 
-def closed_forms(
-    chain: Chain, observations: Observations, arm: FloatArray | None = None
-) -> Iterator[Chain]:
-    """Yield the chain with base and tool for poses, positions or a socket, in closed form.
+def closed_forms(chain: Chain, observations: Observations) -> Iterator[Chain]:
+    """Yield the chain with base and tool for poses, positions or a socket, in closed form."""
+    return _each(chain, closed_frames(chain, observations, flange(chain, observations)))
 
-    `arm` (..., N, 4, 4) are the poses of the bare arm, if known. Of measurements stacked as
-    (..., N, 3) each has its own frames (..., 4, 4).
+
+def closed_frames(chain: Chain, observations: Observations, arm: FloatArray) -> FloatArray:
+    """Return the closed forms of base and tool (2, R, ..., 4, 4), given the bare arm's poses.
+
+    Of measurements stacked as (..., N, 3), with poses (..., N, 4, 4), each has its own frames.
     """
-    arm = flange(chain, observations) if arm is None else arm
-    for rotation in _closed_form(chain, arm, observations):
-        yield _complete(chain, arm, observations, rotation)
+    turns = _closed_form(chain, arm, observations)
+    shape = (*arm.shape[:-3], 3, 3)
+    every = np.array([np.broadcast_to(turn, shape) for turn in turns])
+    return _complete(chain, arm, observations, every)
+
+
+def _each(chain: Chain, frames: FloatArray) -> Iterator[Chain]:
+    """Yield the chain with each pair of base and tool (2, R, 4, 4)."""
+    return (_placed(chain, *pair) for pair in zip(*frames, strict=True))
 
 
 def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iterator[Chain]:
@@ -316,10 +324,10 @@ def _centred(values: FloatArray) -> FloatArray:
 
 def _complete(
     chain: Chain, arm: FloatArray, observations: Observations, rotation: FloatArray
-) -> Chain:
-    """Return the chain with the rest of its frames in closed form, for base rotations."""
+) -> FloatArray:
+    """Return base and tool (2, R, ..., 4, 4) in closed form, for base rotations (R, ..., 3, 3)."""
     base, tool = chain.frame('base'), chain.frame('tool')
-    shape = (*arm.shape[:-3], 4, 4)
+    shape = (*rotation.shape[:-2], 4, 4)
     base_matrix, tool_matrix = (np.broadcast_to(f.matrix, shape).copy() for f in (base, tool))
     if not base.fixed:
         base_matrix[..., :3, :3] = rotation
@@ -344,8 +352,9 @@ def _complete(
         shift = _shortest(turns, wanted - known, not base.fixed)
         tool_matrix[..., :3, 3] += shift
         wanted -= _applied(turns, shift)
-    base_matrix[..., :3, 3] = np.einsum('...ij,...j->...i', rotation, wanted.mean(axis=-2))
-    return _placed(chain, base_matrix, tool_matrix)
+    if not base.fixed:
+        base_matrix[..., :3, 3] = np.einsum('...ij,...j->...i', rotation, wanted.mean(axis=-2))
+    return np.array([base_matrix, tool_matrix])
 
 
 def _camera_rotation(
@@ -361,9 +370,9 @@ def _camera_rotation(
     parts += [np.broadcast_to(np.eye(3), turned.shape)] * free
     columns = np.concatenate(parts, axis=-1)
     columns = columns.reshape(*shape[:-2], -1, columns.shape[-1])
-    flat = wanted.reshape(*shape[:-2], -1, 1)
+    flat = wanted.reshape(*wanted.shape[:-2], -1, 1)
     found = (np.linalg.pinv(columns, rcond=1e-9) @ flat)[..., :9, 0]
-    return se3.nearest_rotation(found.reshape(*shape[:-2], 3, 3))
+    return se3.nearest_rotation(found.reshape(*found.shape[:-1], 3, 3))
 
 
 def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:
@@ -377,7 +386,7 @@ def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:
     flat = turned.reshape(*turned.shape[:-3], -1, 3)
     across = np.swapaxes(flat, -1, -2)
     squares, axes = np.linalg.eigh(across @ flat)
-    along = np.swapaxes(axes, -1, -2) @ (across @ wanted.reshape(*flat.shape[:-1], 1))
+    along = np.swapaxes(axes, -1, -2) @ (across @ wanted.reshape(*wanted.shape[:-2], -1, 1))
     known = squares > (DEGENERATE / EXCEPTION) ** 2 * turned.shape[-3]
     along[..., 0] *= known / np.where(known, squares, 1.0)
     return np.asarray((axes @ along)[..., 0])
