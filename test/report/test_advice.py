@@ -18,6 +18,8 @@ from calib_ros.report import advice, refusals
 from calib_ros.report.advised import advice_of
 from calib_ros.report.markdown import markdown
 
+pytestmark = pytest.mark.usefixtures('single')
+
 
 @pytest.mark.parametrize('auto', [False, True])
 @pytest.mark.parametrize('rule', Rule)
