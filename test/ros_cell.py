@@ -15,6 +15,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
+from contextlib import contextmanager
 
 import numpy as np
 import rclpy
@@ -84,12 +86,9 @@ class Cell:
     def __init__(self, **parameters):
         self._lock, self.domain = free_domain()
         self.context = rclpy.Context()
-        rclpy.init(
-            context=self.context,
-            args=[],
-            domain_id=self.domain,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
+        none = SignalHandlerOptions.NO
+        given = {'args': [], 'domain_id': self.domain, 'signal_handler_options': none}
+        rclpy.init(context=self.context, **given)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.peer = Node('peer', context=self.context)
         self.executor.add_node(self.peer)
@@ -132,6 +131,17 @@ class Cell:
             assert time.monotonic() < end, 'timed out'
             self.executor.spin_once(timeout_sec=0.02)
 
+    @contextmanager
+    def _without_reports(self):
+        """Let the nodes here neither report nor advise: it costs more than what is asked."""
+        period = round(1e9 * node_module.DIAGNOSTICS_PERIOD)
+        reports = [t for node in self.nodes for t in node.timers if t.timer_period_ns == period]
+        for timer in reports:
+            timer.cancel()
+        yield
+        for timer in reports:
+            timer.reset()
+
     def start_call(self, name, request=None, node='/calibration_node'):
         """Call a service of a node; return the future answer."""
         kind = {Trigger.Request: Trigger, SetBool.Request: SetBool}.get(type(request), Trigger)
@@ -141,8 +151,9 @@ class Cell:
 
     def call(self, name, request=None, node='/calibration_node'):
         """Call a service of a node; return what the client receives."""
-        future = self.start_call(name, request, node)
-        self.spin_until(future.done)
+        with self._without_reports():
+            future = self.start_call(name, request, node)
+            self.spin_until(future.done)
         return future.result()
 
     def done(self, *call, **more):
@@ -204,21 +215,13 @@ class Cell:
             stream = 'joints' if isinstance(messages[0], JointState) else 'measurements'
             queue += [(stamp_ns(m), stream, publisher, m) for m in messages]
         queue.sort(key=lambda item: item[0])
-        period = round(1e9 * node_module.DIAGNOSTICS_PERIOD)
-        reports = [t for node in self.nodes for t in node.timers if t.timer_period_ns == period]
-        for timer in reports:  # they cost more than the messages
-            timer.cancel()
-        for _, burst in itertools.groupby(queue, key=lambda item: item[0] // BURST_NS):
-            wanted = node.session.received.copy() if node else {}
-            for _, stream, publisher, message in burst:
-                publisher.publish(message)
-                if node:
+        with self._without_reports():
+            for _, burst in itertools.groupby(queue, key=lambda item: item[0] // BURST_NS):
+                wanted = node.session.received.copy() if node else Counter()
+                for _, stream, publisher, message in burst:
+                    publisher.publish(message)
                     wanted[stream] += 1
-            self.spin_until(
-                lambda end=wanted: all(node.session.received[k] >= n for k, n in end.items())
-            )
-        for timer in reports:
-            timer.reset()
+                self.spin_until(lambda end=wanted: not node or node.session.received >= end)
 
 
 NODE = f"""
