@@ -11,7 +11,7 @@ speeds are not known, joints measured in motion seem to be off at random.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -47,23 +47,25 @@ def timed(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
     """
     told = list[str]()
     remedy = 'Stamp everything as it is measured, by one clock, or stop at each pose (mode dwell)'
-    for base in sorted({each.base for each in problem.sets if _in_motion(each)}):
-        try:
-            steady, change = _without_drift(problem, Parameter(base, DELAY))
-            problem, jitter = _without_jitter(steady, Parameter(base, DELAY))
-        except (CalibrationError, np.linalg.LinAlgError):  # told by the whole fit
-            break
-        if change:
-            told.append(
-                f'{base}.delay changes by {two_digits(1e3 * change)} ms over the session: clocks '
-                f'drift apart or jump. Joint values are corrected for it. {remedy}'
-            )
-        if jitter:
-            told.append(
-                f'measurements of {base} are early or late by {two_digits(1e3 * jitter)} ms at '
-                'random: stamps jitter, or the device or the joint states are smoothed. Errors '
-                f'along the motion count for less. {remedy}'
-            )
+    bases = sorted({each.base for each in problem.sets if _in_motion(each)})
+    try:
+        problem, changes = _without_drift(problem, bases)
+        for base, change in zip(bases, changes, strict=True):
+            if change:
+                told.append(
+                    f'{base}.delay changes by {two_digits(1e3 * change)} ms over the session: '
+                    f'clocks drift apart or jump. Joint values are corrected for it. {remedy}'
+                )
+        for base in bases:
+            problem, jitter = _without_jitter(problem, base)
+            if jitter:
+                told.append(
+                    f'measurements of {base} are early or late by {two_digits(1e3 * jitter)} ms '
+                    'at random: stamps jitter, or the device or the joint states are smoothed. '
+                    f'Errors along the motion count for less. {remedy}'
+                )
+    except (CalibrationError, np.linalg.LinAlgError):  # told by the whole fit
+        pass
     return problem, tuple(told)
 
 
@@ -76,60 +78,64 @@ def _lacking(fitted: Fitted) -> bool:
 
 
 def _changed(
-    problem: Problem, delay: Parameter, change: Callable[[Observations], Observations]
+    problem: Problem, bases: Sequence[str], change: Callable[[Observations], Observations]
 ) -> Problem:
-    """Return the problem with other measurements in motion by the device with a delay."""
+    """Return the problem with other measurements in motion by some devices."""
     fitted, judging = (
-        [change(e) if e.base == delay.owner and _in_motion(e) else e for e in sets]
+        [change(e) if e.base in bases and _in_motion(e) else e for e in sets]
         for sets in (problem.sets, problem.judging)
     )
     return problem.with_sets(fitted, held_out=judging)
 
 
-def _without_drift(given: Problem, delay: Parameter) -> tuple[Problem, float]:
-    """Return a problem with joints where they were seen, and how much the delay changes [s].
+def _without_drift(given: Problem, bases: Sequence[str]) -> tuple[Problem, list[float]]:
+    """Return a problem with joints where they were seen, and how much the delays change [s].
 
-    By polynomials in time of the delay, fitted beside all parameters.
+    By polynomials in time of the delays, fitted together beside all parameters: a device whose
+    delay still changes would bend the arm for the others.
     """
-    stamps = np.concatenate([e.stamps_ns for e in given.sets if e.base == delay.owner])
-    first, whole = stamps.min(), max(np.ptp(stamps), 1)
-    problem, sizes = given, np.zeros(TELLING)
+    stamps = {b: np.concatenate([e.stamps_ns for e in given.sets if e.base == b]) for b in bases}
+    problem, sizes = given, np.zeros(TELLING * len(bases))
 
-    def waves(each: Observations) -> FloatArray:
-        times = np.clip(2.0 * ((each.stamps_ns - first) / whole) - 1.0, -1.0, 1.0)
-        return np.polynomial.legendre.legvander(times, TELLING)[:, 1:]
+    def waves(each: Observations) -> FloatArray:  # (N, TELLING D)
+        own = stamps.get(each.base, each.stamps_ns)
+        times = 2.0 * (each.stamps_ns - own.min()) / max(np.ptp(own), 1) - 1.0
+        found = np.polynomial.legendre.legvander(np.clip(times, -1.0, 1.0), TELLING)[:, 1:]
+        mine = np.array([float(each.base == base) for base in bases])
+        return np.einsum('b,nt->nbt', mine, found).reshape(len(each), -1)
 
     def moved(each: Observations) -> Observations:
         read = np.zeros(len(each)) if each.delay is None else each.delay
         return replace(each.earlier(read + waves(each) @ sizes), delay=each.delay)
 
-    for _ in range(SEVERAL):
-        fitted, rows = _rows(problem, delay)
+    for _ in range(SEVERAL * bool(bases)):
+        fitted, rows = _rows(problem)
         count = len(rows[0]) - 2
         for k, each in enumerate(fitted.problem.sets):
-            added = rows[k][count] * waves(each).T[:, np.newaxis] * (each.base == delay.owner)
+            added = rows[k][count] * waves(each).T[:, np.newaxis]
             rows[k] = np.concatenate([rows[k][:count], added, rows[k][-1:]])
         matrix, poses = stacked(rows), sum(each.shape[-1] for each in rows)
         share = gain_share(matrix, count)  # late poses have all their errors together
-        chance = special.betainc(0.5 * (poses - TELLING), 0.5 * TELLING, max(1.0 - share, 0.0))
+        halves = 0.5 * (poses - len(sizes)), 0.5 * len(sizes)
+        chance = special.betainc(*halves, max(1.0 - share, 0.0))
         if not (share > EXCEPTION and chance < 1.0 - SURE and _lacking(fitted)):
             break
         sizes += np.linalg.lstsq(matrix[:, :-1], matrix[:, -1])[0][count:]
-        problem = _changed(given, delay, moved)
-    changes = [waves(e) @ sizes for e in given.sets if e.base == delay.owner]
-    return problem, float(np.ptp(np.concatenate(changes)))
+        problem = _changed(given, bases, moved)
+    moves = [[waves(e) @ sizes for e in given.sets if e.base == base] for base in bases]
+    return problem, [float(np.ptp(np.concatenate(each))) for each in moves]
 
 
-def _without_jitter(problem: Problem, delay: Parameter) -> tuple[Problem, float]:
+def _without_jitter(problem: Problem, base: str) -> tuple[Problem, float]:
     """Return a problem with larger covariances along the velocity, and the jitter [s].
 
     Told by errors along it that are larger than those across. A fit to these is nearer to the arm,
     and tells more.
     """
-    mine = [k for k, e in enumerate(problem.sets) if e.base == delay.owner and _in_motion(e)]
+    mine = [k for k, e in enumerate(problem.sets) if e.base == base and _in_motion(e)]
     found = 0.0
     for _ in range(SEVERAL):
-        fitted, rows = _rows(problem, delay)
+        fitted, rows = _rows(problem)
         matrix = stacked(rows)
         late = np.append(-np.linalg.lstsq(matrix[:, :-1], matrix[:, -1])[0], 1.0)
         few = np.concatenate([rows[k][:, :3] for k in mine], axis=2)
@@ -143,23 +149,23 @@ def _without_jitter(problem: Problem, delay: Parameter) -> tuple[Problem, float]
             break
         ratio = jitter / max(across, 1e-300)
         found += ratio
-        problem = _changed(problem, delay, partial(_widened, fitted, delay, ratio))
+        problem = _changed(problem, [base], partial(_widened, fitted, ratio))
     return problem, float(np.sqrt(found * across))
 
 
-def _widened(fitted: Fitted, delay: Parameter, jitter: float, each: Observations) -> Observations:
+def _widened(fitted: Fitted, jitter: float, each: Observations) -> Observations:
     """Return measurements whose delay has a variance (of `jitter`, in that of the noise)."""
     turned = np.full_like(each.oriented, each.oriented.any())
     plain = Samples(each.changed(covariance=None, oriented=turned), 1.0, 1.0)
-    moved = plain.rows_of(fitted.chain, [delay])[0]
+    moved = plain.rows_of(fitted.chain, [Parameter(each.base, DELAY)])[0]
     problem = fitted.problem
     wide = each.covariances((problem.sigma_position, problem.sigma_orientation))
     wide[:, : len(moved), : len(moved)] += jitter * np.einsum('in,jn->nij', moved, moved)
     return replace(each, covariance=wide)
 
 
-def _rows(problem: Problem, delay: Parameter) -> tuple[Fitted, list[FloatArray]]:
-    """Return a fit to some samples, and their rows (P, c, N): of a delay, then the residual.
+def _rows(problem: Problem) -> tuple[Fitted, list[FloatArray]]:
+    """Return a fit to some samples, and their rows (P, c, N): of its delay, then the residual.
 
     Those of delays of single joints are before them. Gross errors count for less: a part of the
     session may seem to be some.
@@ -171,8 +177,11 @@ def _rows(problem: Problem, delay: Parameter) -> tuple[Fitted, list[FloatArray]]
         few = tuple(replace(each, approach=each.velocity) for each in few)
     weights = [weights_of(each, 'huber') for each in fitted.robust.distances]
     system = problem.system(few).weighted(weights)
-    chain, names = fitted.chain.with_effects(lags), [*fitted.names, *lags, delay]
-    return fitted, system.rows_of(chain, names)
+    chain, names = fitted.chain.with_effects(lags), [*fitted.names, *lags]
+    return fitted, [
+        samples.rows_of(chain, [*names, Parameter(each.base, DELAY)])
+        for samples, each in zip(system.sets, few, strict=True)
+    ]
 
 
 def uneven(problem: Problem, result: Identification) -> tuple[str, Problem] | None:

@@ -61,6 +61,19 @@ def test_a_delay_that_changes_is_undone_where_the_arm_moved():
     np.testing.assert_array_equal(again.after.position, result.validation.after.position)
 
 
+def test_delays_of_two_devices_change_together():
+    """One after the other, the second bent the arm for the first: accepted, 0.9 -> 4.3 mm."""
+    delays = 8e-3 * np.linspace(-1.0, 1.0, 100)[:, np.newaxis]
+    seen = moving(100, delays)
+    one, two = seen.select(np.s_[::2]), replace(seen.select(np.s_[1::2]), base='base_B')
+    there, told = timed(Problem(UR10E, one, more=(two,), **SIGMAS))
+    assert [each.split()[0] for each in told] == ['base.delay', 'base_B.delay']
+    for k, (before, after) in enumerate(zip((one, two), there.sets, strict=True)):
+        moved = np.median((after.joints - before.joints) / before.velocity, axis=1)
+        late = delays[k::2, 0] - delays[k::2].mean()
+        np.testing.assert_allclose(moved - moved.mean(), -late, rtol=0, atol=4e-4)
+
+
 @pytest.mark.parametrize('oriented', [True, False])
 def test_of_stamps_that_jitter_errors_along_the_motion_count_for_less(oriented):
     """They were taken for noise alike in all directions."""
