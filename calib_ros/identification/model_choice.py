@@ -34,17 +34,19 @@ def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Id
     progress(f'model {"geometric" if model == "auto" else model}')
     if model != 'auto':
         return identify(replace(problem, effects=effects_of(model)), progress=progress)
-    problem, late = timed(problem)
+    given = problem
+    problem, late = timed(given)
     poses = max(1, sum(map(len, problem.sets)))
     columns = 2 * len(HARMONICS) * len(problem.chain.joints)
     fit, tried = len(problem.free) * poses, columns * min(poses, COMPARED)
     first, second = np.array([fit, fit + tried]) / (2 * fit + tried)  # entries of all columns
     result = identify(problem, progress=share_of(progress, 0.0, first))
     chosen, verdicts = _choose_effects(problem, result, share_of(progress, first, second))
+    result = replace(result, remarks=(*late, *result.remarks))
     if chosen:
         progress(f'model with {len(chosen)} effects')
         rest = share_of(progress, second, 1.0)
-        richer = identify(replace(problem, effects=chosen), result, rest)
+        richer = identify(replace(given, effects=chosen), result, rest)  # which hides no delay
         reasons: tuple[str, ...] = richer.refusals if result.accepted else ()
         if not richer.converged:
             reasons = ('its fit has not converged',)
@@ -53,7 +55,7 @@ def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Id
             result = replace(result, remarks=(*result.remarks, remark))
         else:
             result = richer
-    return replace(result, verdicts=verdicts, remarks=(*late, *result.remarks))
+    return replace(result, verdicts=verdicts)
 
 
 def _choose_effects(

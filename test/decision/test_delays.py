@@ -5,13 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, arm, rms
+from fits import NOISE, SCARA, SIGMAS, UR10E, arm, rms
 
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.comparison import compare
 from calib_ros.decision.delays import other_delay, timed, uneven
 from calib_ros.decision.reasons import Rule
+from calib_ros.identification.model_choice import identify_model
+from calib_ros.kinematics.effects import members
 from calib_ros.kinematics.se3 import exp_rotation
 from calib_ros.settings import Settings
 
@@ -158,3 +160,21 @@ def test_places_of_a_device_in_blocks_are_no_lag():
     result = identify(Problem(UR10E, Observations.from_arrays(joints, seen)))
     assert result.posterior.unmodelled.turns > Settings.largest_angle
     assert result.refusals[0].rule is Rule.LARGEST_ERROR
+
+
+def test_play_is_told_as_no_delay_by_a_model_that_holds_it():
+    """It was undone as a delay that changes, and the delay undone again beside the play."""
+    rng = np.random.default_rng(1)
+    play = {name: rng.normal(scale=5e-4) for name in members(SCARA, 'backlash')}
+    true = arm(rng, 0.4, SCARA).with_effect_values(play)
+    rate, start = rng.uniform(0.1, 0.6, (4, 3)), rng.uniform(0.0, 6.0, (4, 3))
+    waves = rate * np.arange(0.0, 15.0, 0.1)[:, np.newaxis, np.newaxis] + start
+    size = np.array([0.6, 0.6, 0.04, 0.8])
+    joints = np.array([0.0, 0.0, 0.15, 0.0]) + size * np.sin(waves).sum(axis=2)
+    speed = size * (rate * np.cos(waves)).sum(axis=2)
+    seen = replace(measure(true, joints, rng, *NOISE, approach=np.sign(speed)), velocity=speed)
+    problem = Problem(SCARA, seen, **SIGMAS)
+    assert timed(problem)[1]
+    result = identify_model(problem, 'auto')
+    assert any('backlash' in name for name in result.names)
+    assert not any('delay changes' in each for each in result.remarks)
