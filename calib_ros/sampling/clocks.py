@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib_ros.estimation.levels import SEVERAL
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.buffers import Rows
@@ -93,7 +94,7 @@ class Clocks:
         return not 0 <= now_ns - self._looked_ns <= WATCH_NS
 
     def look(self, now_ns: int) -> None:
-        """Evaluate the motion if it is due, and start again."""
+        """Evaluate the motion if it is due, and start again unless it was too little."""
         if not self.due(now_ns):
             return
         track = Track(self._revolute, self.settings.max_gap, self.settings.pose_buffer)
@@ -101,31 +102,33 @@ class Clocks:
             track.extend(columns, rows.stamps, rows.values)
         track.sort()
         joints = track.samples()
-        if self._looked_ns and len(joints[0]):
-            self._evaluate(joints)
+        little = bool(self._looked_ns) and len(joints[0]) > 0 and not self._evaluate(joints)
         self._looked_ns = now_ns
-        self._joints.clear()
-        self._poses.clear()
+        if not little or np.ptp(joints[0]) > SEVERAL * WATCH_NS:
+            self._joints.clear()
+            self._poses.clear()
 
-    def _evaluate(self, joints: Series) -> None:
+    def _evaluate(self, joints: Series) -> bool:
+        """Tell whether the motion shows a delay; between long stops it may take longer."""
         poses = self._poses.values()
         for rows in poses:
             rows.sort()
         measured = [(rows.stamps, rows.values) for rows in poses]
-        stand = bool(np.ptp(joints[1], axis=0).max() <= self.settings.still)
+        latest = joints[1][joints[0] > self._looked_ns]
+        stand = len(latest) > 0 and bool(np.ptp(latest, axis=0).max() <= self.settings.still)
         deaf = stand and bool(poses) and all(map(self._moves_much, poses))
         self._deaf += deaf
         self._stuck = deaf or (stand and self._stuck)
         found = self._delay_of(joints, measured)
         if found is None:
-            return
+            return False
         known = self._seen
         every = (found.seconds, *found.rivals)  # SMOOTHING is the resolution of speeds
         least = max(SMOOTHING, found.within, known.within if known else 0.0)
         if known is None or min(abs(each - known.seconds) for each in every) > least:
             if found.rivals:
                 self._unclear = found if known is None else None
-                return
+                return True
             if known is not None:
                 self._moves.append((found.seconds - known.seconds, self._agreed))
             self._seen, self._unclear = found, None
@@ -133,12 +136,13 @@ class Clocks:
             self._seen = found  # known better
         self._agreed = self._taken
         self._awake = self._continuous
+        return True
 
     def _moves_much(self, rows: Rows) -> bool:
         """Tell whether a target moves by more than errors are."""
-        places = rows.values[:, POSITION_SLICE]
+        places = rows.values[rows.stamps > self._looked_ns, POSITION_SLICE]
         far = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-        return bool(np.median(far) > self.settings.largest_error)
+        return len(far) > 0 and bool(np.median(far) > self.settings.largest_error)
 
     def find(self, collector: Collector, now_ns: int | None) -> None:
         """Estimate the delay for a collector, at intervals until it is clear.

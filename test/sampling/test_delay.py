@@ -85,6 +85,13 @@ def test_a_delay_that_little_motion_tells_roughly_is_looked_for_in_more():
     assert session.delay.seconds == pytest.approx(0.2, abs=2e-2)
 
 
+def test_a_delay_is_found_between_stops_so_long_that_hardly_anything_moves():
+    """Each few seconds were evaluated alone: of 1.5 s of motion they showed none."""
+    motion = stops(0.7 * UR10E.random_joints(20, np.random.default_rng(0)), 0.5, 2.0)
+    session, *_ = recorded(0.15, oriented=False, motion=motion, mode='dwell')
+    assert session.delay.seconds == pytest.approx(0.15, abs=5e-3)
+
+
 def test_without_motion_there_is_no_delay():
     still, *_ = recorded(0.1, seconds=10.0, motion=stops(np.array([[0, -1.2, 1.2, -1, 1, 0.0]])))
     assert still.delay is None
