@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import reduce
+from functools import cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -326,16 +326,21 @@ def _beam_search(problem: Problem, chain: Chain, given: Trial) -> Diagnosis | No
     largest, least = min(fault_limit(problem), NEARER * given.error), given.share
     share = NEARER * min(least, 1.0)
     kept: list[tuple[Suspect, ...]] = [()]
+
+    @cache
+    def undone(these: tuple[Suspect, ...]) -> Sets:
+        return these[-1].undo_in(undone(these[:-1])) if these else few
+
     for number in range(SEVERAL + 1):  # several of joints, one of the poses
         found: dict[float, tuple[Trial, tuple[Suspect, ...]]] = {}
-        tried = list[tuple[Suspect, ...]]()
+        tried = dict[tuple[Suspect, ...], None]()
         together = [(*these, each) for these in kept for each in options]
         for these in together if number else [*together, *hidden(chain, options)]:
             if len({one.part for one in these}) == len(these):
                 more = tuple(sorted(these, key=lambda one: (*FIRST, one.part).index(one.part)))
-                tried.append(more)
-        undone = (reduce(lambda sets, one: one.undo_in(sets), more, few) for more in tried)
-        for more, trial in zip(tried, trials_of((chain, sets) for sets in undone), strict=True):
+                tried[more] = None
+        trials = trials_of((chain, undone(more)) for more in tried)
+        for more, trial in zip(tried, trials, strict=True):
             found.setdefault(round(trial.share, 6), (trial, more))  # first of equivalent ones
         best = [found[key] for key in sorted(found)[:TRIED]]
         if not best or (number and best[0][0].share > CONFIDENT * least):

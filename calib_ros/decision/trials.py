@@ -37,13 +37,27 @@ class Trial:
 
     The smaller of the spreads of flange and measured positions: if metres are taken for
     millimetres, or radians for degrees, every error is small. `arms` are the poses (N, 4, 4) of
-    the bare arm.
+    the bare arm, `found` holds frames (C, 4, 4) of many trials, of which this is one `number`.
     """
 
-    chain: Chain
+    start: Chain
     sets: Sets
     arms: tuple[FloatArray, ...]
     spread: float = 1.0
+    found: Chain | None = None
+    number: int = 0
+
+    @cached_property
+    def chain(self) -> Chain:
+        """Return the chain in the frames found."""
+        chain, found = self.start, self.found
+        if found is None:
+            return chain
+        for each in self.sets:
+            for name in (each.base, each.tool):
+                frame = found.frame(name)
+                chain = chain.with_frame(name, replace(frame, matrix=frame.matrix[self.number]))
+        return chain
 
     @cached_property
     def error(self) -> float:
@@ -104,11 +118,9 @@ def _at_once(tried: Sequence[tuple[Chain, Sets]]) -> Iterator[Trial]:
         seen.append((each, arm))
     errors = _usual(np.concatenate([sample_errors(found, *each) for each in seen], axis=1))
     spread = np.median(spreads, axis=0)
-    frames = {name: found.frame(name) for each, _ in seen for name in (each.base, each.tool)}
     for k, (chain, sets) in enumerate(tried):
-        for name, frame in frames.items():
-            chain = chain.with_frame(name, replace(frame, matrix=frame.matrix[k]))
-        trial = Trial(chain, sets, tuple(arm[k] for _, arm in seen), float(spread[k]))
+        arms = tuple(arm[k] for _, arm in seen)
+        trial = Trial(chain, sets, arms, float(spread[k]), found, k)
         vars(trial)['error'] = float(errors[k])
         yield trial
 

@@ -172,8 +172,8 @@ class Observations(Shown):
 
     def changed(self, **values: Any) -> Observations:
         """Return the pairs with other values of some fields, unchecked."""
-        found = object.__new__(Observations)
-        vars(found).update({name: vars(self)[name] for name in self.__dataclass_fields__} | values)
+        found, known = object.__new__(Observations), vars(self)
+        vars(found).update({name: known[name] for name in self.__dataclass_fields__} | values)
         return found
 
     def select(self, mask: NDArray[np.generic] | slice) -> Observations:
