@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -73,19 +73,22 @@ def arms_own(fitted: Fitted) -> str | None:
     return None
 
 
-def frozen_joints(fitted: Fitted) -> tuple[str, ...]:
+def frozen_joints(fitted: Fitted) -> tuple[tuple[str, ...], list[Observations]]:
     """Return which joint values repeat in gross errors that a motion of this joint explains.
 
-    A joint that rests moves in no pose, and one whose zero is off is off by one angle.
+    A joint that rests moves in no pose, and one whose zero is off is off by one angle. The sets
+    follow, with the values that explain the errors: what else moved shows in these.
     """
-    chain, told = fitted.chain, list[str]()
-    for each, good in zip(fitted.problem.sets, fitted.robust.inliers, strict=True):
+    chain, told, sets = fitted.chain, list[str](), list(fitted.problem.sets)
+    for number, (each, good) in enumerate(zip(sets, fitted.robust.inliers, strict=True)):
         if each.socket or each.inverse or each.distances is not None or each.pixels is not None:
             continue
         again = np.abs(np.diff(each.joints, axis=0, prepend=np.nan)) <= ROUNDING
-        odd = ~good & ~again.all(axis=1)
+        odd, joints = ~good & ~again.all(axis=1), each.joints.copy()
         for k, joint in enumerate(chain.joints):
             rows, found = np.flatnonzero(again[:, k] & odd), list[int]()
+            if len(rows) < LEAST_ASIDE:
+                continue
             offsets, before, after = _moved_alone(chain, each.select(rows), k)
             runs = np.cumsum(~again[:, k])[rows]
             for run in np.unique(runs):
@@ -94,19 +97,21 @@ def frozen_joints(fitted: Fitted) -> tuple[str, ...]:
                 better = np.linalg.norm(after[mine]) < EXCEPTION * np.linalg.norm(before[mine])
                 if mine.sum() >= LEAST_ASIDE and wide and better:
                     found += range(rows[mine][0], rows[mine][-1] + 1)
+                    joints[rows[mine], k] += offsets[mine]
             if found:
                 where = rows_in_words(found, each.stamps_ns, fitted.problem.of_messages)
                 told.append(
                     f'{joint.name} moved in {where}, but its values repeat there: look for the '
                     "cause in the robot's driver or the table, and measure these poses again"
                 )
-    return tuple(told)
+                sets[number] = replace(each, joints=joints)
+    return tuple(told), sets
 
 
 def _moved_alone(
     chain: Chain, seen: Observations, k: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return by how much joint k (N,) [rad or m] is off, and errors [m] before and after that.
+    """Return by how much values of joint k (N,) are off, and errors [m] before and after that.
 
     By orientations, if these are measured; else about its axis, or along it.
     """
@@ -122,8 +127,8 @@ def _moved_alone(
     offsets = np.where(seen.oriented, turned, offsets)
     if joint.type == 'prismatic':
         offsets = np.einsum('nc,nc->n', along, left.position)
-    joints = seen.joints.copy()
-    joints[:, k] += joint.sign * offsets
+    joints, offsets = seen.joints.copy(), joint.sign * offsets
+    joints[:, k] += offsets
     both = seen, seen.changed(joints=joints)
     before, after = (sample_errors(chain, each, flange(chain, each)) for each in both)
     return offsets, before, after

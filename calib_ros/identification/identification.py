@@ -108,8 +108,8 @@ def _identified(
     uncertainty = replace(uncertainty, parts=wider**2 * uncertainty.parts)
     parameters = parameter_rows(fitted, uncertainty)
     region, scaled = _region(inference, posterior, wider)
-    (wrong, corrected), stuck = wrong_distances(fitted), frozen_joints(fitted)
-    step = find_step(corrected) if corrected and not stuck else None
+    stuck, thawed = frozen_joints(fitted)
+    wrong, corrected = wrong_distances(fit(problem.with_sets(thawed)) if stuck else fitted)
     result = Identification(
         chain=chain,
         before=before.chain,
@@ -132,7 +132,7 @@ def _identified(
         posterior=posterior.widened(wider),
         region=region,
         weak=_weak(problem, parameters),
-        step=step,
+        step=(step := find_step(corrected) if corrected else None),
         remarks=(*stuck, *oddities(problem, posterior, step, coarse)),
         coupled=by_couplings > 0.0,
         surprise=surprise,
