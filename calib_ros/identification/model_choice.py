@@ -42,7 +42,8 @@ def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Id
     first, second = np.array([fit, fit + tried]) / (2 * fit + tried)  # entries of all columns
     result = identify(problem, progress=share_of(progress, 0.0, first))
     chosen, verdicts = _choose_effects(problem, result, share_of(progress, first, second))
-    result = replace(result, remarks=(*late, *result.remarks))
+    if late:
+        result = replace(result, remarks=(*late, *result.remarks))
     if chosen:
         progress(f'model with {len(chosen)} effects')
         rest = share_of(progress, second, 1.0)

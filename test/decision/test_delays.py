@@ -165,7 +165,7 @@ def test_places_of_a_device_in_blocks_are_no_lag():
 def test_play_is_told_as_no_delay_by_a_model_that_holds_it():
     """It was undone as a delay that changes, and the delay undone again beside the play."""
     rng = np.random.default_rng(1)
-    play = {name: rng.normal(scale=5e-4) for name in members(SCARA, 'backlash')}
+    play = {name: rng.normal(scale=1e-3) for name in members(SCARA, 'backlash')}
     true = arm(rng, 0.4, SCARA).with_effect_values(play)
     rate, start = rng.uniform(0.1, 0.6, (4, 3)), rng.uniform(0.0, 6.0, (4, 3))
     waves = rate * np.arange(0.0, 15.0, 0.1)[:, np.newaxis, np.newaxis] + start
