@@ -33,6 +33,7 @@ from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.system import stacked
 from calib_ros.estimation.weights import weights_of
 from calib_ros.kinematics import effects
+from calib_ros.kinematics.joint import small_units
 from calib_ros.kinematics.parameter import DELAY, Parameter
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXCEPTION, Settings
@@ -240,7 +241,7 @@ def unsteady(problem: Problem, result: Identification) -> tuple[str, bool]:
         return '', False
     before, after = result.comparison.figures
     slight = before.rms_mm < ALIKE * after.rms_mm and lacking.turns > typical / NEARER
-    unit = ' or '.join(sorted({f'm{joint.driven.unit}' for joint in problem.chain.joints}))
+    unit = small_units(problem.chain.joints)
     text = (
         f'joints seem off by {two_digits(1e3 * lacking.turns)} {unit} at random, from pose to '
         'pose: the arm moved while it was measured, joint values and poses are not of one moment, '

@@ -84,8 +84,6 @@ class Observations(Shown):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.approach is None and self.velocity is not None:
-            object.__setattr__(self, 'approach', np.sign(self.velocity))
         if not (self.base.startswith('base') and self.tool.startswith('tool')):
             ends = f'"{self.base:.100}" and "{self.tool:.100}"'
             raise InputError(f'the names of frames begin with base and tool, not as {ends}')
@@ -105,6 +103,8 @@ class Observations(Shown):
                 )
             if name != 'covariance' and not np.isfinite(array).all():
                 raise InputError(f'{name} of the observations hold NaN or infinite values')
+        if self.approach is None and self.velocity is not None:
+            object.__setattr__(self, 'approach', np.sign(self.velocity))
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         arrays = {name: getattr(self, name) for name in _SHAPES}

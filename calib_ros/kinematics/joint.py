@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Literal, TypeAlias, get_args
@@ -133,6 +133,11 @@ class Frame:
     def offsets(self, reference: Frame | None = None) -> FloatArray:
         """Return the move (6,) from `reference`: x, y, z [m] and a rotation vector [rad]."""
         return _move(self, reference or ANYWHERE)
+
+
+def small_units(joints: Iterable[Joint]) -> str:
+    """Return in which unit small errors of joint values are told: mm, mrad, or either."""
+    return ' or '.join(sorted({f'm{joint.driven.unit}' for joint in joints}))
 
 
 @lru_cache(maxsize=16)

@@ -21,6 +21,7 @@ from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.joint import small_units
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.report.advice import COARSE, FAR
@@ -276,7 +277,7 @@ def unmodelled_in_words(result: Identification) -> str:
     lacking = result.posterior.unmodelled
     seen = lacking.waves * lacking.shown  # else assumed
     across = np.hypot(lacking.tilts, np.sqrt(2.0) * seen)
-    unit = ' or '.join(sorted({f'm{joint.driven.unit}' for joint in result.chain.joints}))
+    unit = small_units(result.chain.joints)
     sizes = (lacking.turns, unit, 'in their values'), (across, 'mrad', 'across their axes')
     off = ' and '.join(f'{1e3 * x:.3f} {of} {way}' for x, of, way in sizes if round(1e3 * x, 3))
     come = 'may come' if result.noise.consistent else 'seems to come'

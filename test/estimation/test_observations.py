@@ -78,6 +78,8 @@ def test_speeds_tell_from_which_side_joints_came(rng):
     assert seen.approach is None
     assert (replace(seen, velocity=speeds).approach == np.sign(speeds)).all()
     assert (replace(seen, velocity=speeds, approach=known).approach == known).all()
+    with pytest.raises(InputError, match=r'^velocity of the observations hold NaN'):
+        replace(seen, velocity=np.nan * speeds)
 
 
 def test_a_plane_needs_heights():
