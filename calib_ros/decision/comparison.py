@@ -48,7 +48,7 @@ class Comparison(Shown):
     Before is the nominal chain with fitted base and tool frames, so that the gain is the arm's.
     `judged` (N,) is False for outliers; `repeated` (N,) is True for held-out pairs at fitted
     configurations, which count nowhere. If the device drifts, so many pairs as are `together` tell
-    as much as one.
+    as much as one. A configuration is one of the `kind`: poses, stations or locations.
     """
 
     before: Residuals
@@ -56,6 +56,7 @@ class Comparison(Shown):
     judged: Flags
     repeated: Flags | None = None
     together: float = 1.0
+    kind: str = 'poses'
 
     @property
     def counting(self) -> Flags:

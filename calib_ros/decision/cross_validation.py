@@ -34,10 +34,10 @@ def cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Comparison
         count_distinct(group) * each.width
         for group, each in zip(problem.configurations, problem.sets, strict=True)
     )
-    groups, what = stations(problem.sets), 'poses'
+    groups, kind = stations(problem.sets), 'poses'
     count = count_distinct(np.concatenate(groups))
     if count < count_distinct(np.concatenate(problem.configurations)):
-        what, system = 'stations', _with_usual_priors(fitted)
+        kind, system = 'stations', _with_usual_priors(fitted)
     folds = _fold_count(problem, names, count, rows)
     if folds < 2:
         return None, 'nothing: too few poses to hold any out'
@@ -48,8 +48,8 @@ def cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Comparison
     fits = (before, frames), (fitted.chain, names)
     chains = zip(*(leave_fold_out(one, some, *by_fold) for one, some in fits), strict=True)
     pair = fold_residuals(chains, problem.sets, groups, numbers)
-    judged = Comparison(*pair, ~fitted.robust.outliers)
-    over = f'{folds}-fold cross-validation over {count:,} different {what}'
+    judged = Comparison(*pair, ~fitted.robust.outliers, kind=kind)
+    over = f'{folds}-fold cross-validation over {count:,} different {kind}'
     return judged, f'{over}{note}{judged.omitted}'
 
 

@@ -46,14 +46,12 @@ def gain_refusals(
         )
     if not gain > limit:
         text = f'RMS {rounded(before.rms_mm)} mm before, {rounded(after.rms_mm)} mm after'
-        at_stations = ' stations' in result.validated_by
         if gain > 0.0:
             count = count_distinct(validation.after.configurations[judged])
-            kind = 'locations' if all(each.socket for each in problem.sets) else 'poses'
-            kind = 'stations' if at_stations else kind
             chance = before.rms_mm * np.exp(-limit)
-            text += f'; with {count} {kind}, chance alone can lower it to {rounded(chance)} mm'
-        if at_stations:
+            text += f'; with {count} {validation.kind}, chance alone can lower it to '
+            text += f'{rounded(chance)} mm'
+        if validation.kind == 'stations':
             text += '; most joints stood still within each: move all joints from pose to pose'
         yield Reason(Rule.GAIN, f'no gain on held-out poses beyond chance ({text})')
     elif result.chance is not None and result.chance > 1.0 - CONFIDENT:

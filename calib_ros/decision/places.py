@@ -69,5 +69,5 @@ def leave_one_place_out(
     number = {base: k for k, place in enumerate(places) for base in place}
     groups = [np.full(len(each), number[each.base]) for each in problem.sets]
     pair = fold_residuals(zip(*chains, strict=True), problem.sets, groups, groups)
-    judged = Comparison(*pair, ~fitted.robust.outliers)
+    judged = Comparison(*pair, ~fitted.robust.outliers, kind='locations')
     return judged, f'leaving out one of {len(places)} locations at a time{judged.omitted}'

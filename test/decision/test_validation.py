@@ -89,9 +89,7 @@ def refused(before, after, judged, largest_error=0.01, **change):
     problem.largest_error = largest_error
     given = {'converged': True, 'parameters': (), 'chance': None, 'region': 1, 'surprise': 0.0}
     judging = Comparison(*parts, judged)
-    result = SimpleNamespace(
-        step=None, not_excited=(), validated_by='', validation=judging, **given | change
-    )
+    result = SimpleNamespace(step=None, not_excited=(), validation=judging, **given | change)
     return [*refusals(problem, result, None, False, True)]
 
 
@@ -109,7 +107,7 @@ def test_a_gain_by_chance_is_told_with_what_chance_can_do(rng):
     assert 0.0 < gain < limit
     (told,) = refused(before, after, np.ones(20, dtype=bool))
     least = 1e3 * np.sqrt((before**2).sum(axis=1).mean()) * np.exp(-limit)
-    assert told.endswith(f'; with 20 locations, chance alone can lower it to {least:.3f} mm)')
+    assert told.endswith(f'; with 20 poses, chance alone can lower it to {least:.3f} mm)')
 
 
 @pytest.mark.parametrize(('left', 'limit', 'said'), [(2e-5, 1e-5, '0.020'), (2.0, 0.01, '2000')])
