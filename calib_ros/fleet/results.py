@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from datetime import datetime, timezone
 
 import calib_ros
 from calib_ros.files.rows import Row
@@ -36,9 +37,10 @@ def verifications(rows: Sequence[Row]) -> tuple[Row, ...]:
 def _unique(rows: Sequence[Row], key: Callable[[Row], object]) -> tuple[Row, ...]:
     """Return rows ordered by time, one for each key.
 
-    Rows filed before their stamps count as measured when filed.
+    Rows filed before their stamps count as measured when filed; those to come do not count.
     """
-    dated = [replace(row, time=row.filed) if too_late(row) else row for row in rows]
+    past = [row for row in rows if not to_come(row)]
+    dated = [replace(row, time=row.filed) if too_late(row) else row for row in past]
     newest = sorted(dated, key=lambda row: (row.software == calib_ros.__version__, row.filed))
     unique = {key(row): row for row in newest}
     return tuple(sorted(unique.values(), key=lambda row: (row.time, row.source, row.key)))
@@ -47,3 +49,8 @@ def _unique(rows: Sequence[Row], key: Callable[[Row], object]) -> tuple[Row, ...
 def too_late(row: Row) -> bool:
     """Tell whether a result was filed before its stamps, in any time zone: a wrong clock."""
     return row.time - row.filed > A_DAY
+
+
+def to_come(row: Row) -> bool:
+    """Tell whether a result was measured and filed by a clock ahead of ours: it has no time."""
+    return min(row.time, row.filed) - datetime.now(timezone.utc) > A_DAY

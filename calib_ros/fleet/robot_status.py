@@ -12,7 +12,7 @@ from calib_ros.errors import CalibrationError
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
-from calib_ros.fleet.results import results, too_late, verifications
+from calib_ros.fleet.results import results, to_come, too_late, verifications
 from calib_ros.fleet.run import Run
 from calib_ros.fleet.watch import Watched, alarms_of, watch
 from calib_ros.shown import counted, rounded, some
@@ -49,6 +49,7 @@ class RobotStatus:
         found = drift([r.rms_mm or 0 for r in known], [r.rms_freedom or 0 for r in known], years)
         watched = watch(compared, years)
         errors, copies = (of.get(robot.serial, {}) for of in (done.errors, done.copies))
+        errors = {**errors, **_to_come(rows)}
         remarks = [f'{one} has the content of {other}: one night' for one, other in copies.items()]
         remarks += [*_clocks(rows, own), *_others(robot, rows, own), *watched.remarks]
         return cls(robot, last, watched, errors, known, found, tuple(remarks))
@@ -116,13 +117,24 @@ def _others(robot: Robot, rows: Sequence[Row], own: Sequence[Row]) -> Iterator[s
         )
 
 
+def _to_come(rows: Sequence[Row]) -> dict[str, str]:
+    ahead = (row for row in rows if to_come(row))
+    return {
+        row.source or row.kind: (
+            f'measured and filed on {row.filed:%Y-%m-%d}, in the future, so it does not count: '
+            f'set the clock, there or here, and remove {row.key}.parquet from the history'
+        )
+        for row in ahead
+    }
+
+
 def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
-    if ahead := [row for row in rows if too_late(row)]:
+    if ahead := [row for row in rows if too_late(row) and not to_come(row)]:
         row = max(ahead, key=lambda each: each.filed)
         yield (
             f'{counted(len(ahead), "result")} with stamps later than the filing, on '
             f'{row.filed:%Y-%m-%d} of {row.time:%Y-%m-%d} ({row.source or row.kind}): set the '
-            'clock of the recorder'
+            'clock of the recorder, or of the computer that filed them'
         )
     if not own:
         return

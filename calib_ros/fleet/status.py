@@ -50,15 +50,21 @@ def _without_twins(found: Sequence[RobotStatus]) -> Iterator[RobotStatus]:
 
 
 def _silent(found: Sequence[RobotStatus]) -> Iterator[RobotStatus]:
-    """Yield statuses; those without several usual nights before the newest of all are told."""
-    newest = max((one.last.time for one in found if one.last is not None), default=None)
+    """Yield statuses; those without several usual nights before the newest of others are told.
+
+    Of nights that one robot alone has, either the others or its own clock may be the reason.
+    """
+    ends = sorted(one.last.time for one in found if one.last is not None)
     for one in found:
         times = [night.row.time for night in one.watched.nights]
-        if newest is not None and one.last is not None and len(times) >= SEVERAL:
+        if len(ends) > 1 and one.last is not None and len(times) >= SEVERAL:
             usual = max(median_low(b - a for a, b in pairwise(times)), timedelta(days=1))
-            if newest - one.last.time > SEVERAL * usual:
-                silence = f'nothing measured since {one.last.time:%Y-%m-%d}; other robots were'
-                one = replace(one, remarks=(*one.remarks, silence))
+            last, newest, told = one.last.time, ends[-2], ''
+            if newest - last > SEVERAL * usual:
+                told = f'nothing measured since {last:%Y-%m-%d}; other robots were'
+            elif last - newest > SEVERAL * usual:
+                told = f'no other robot was measured since {newest:%Y-%m-%d}: is its clock ahead?'
+            one = replace(one, remarks=(*one.remarks, *filter(None, [told])))
         yield one
 
 

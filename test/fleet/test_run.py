@@ -165,50 +165,6 @@ def test_sessions_without_stamps_are_nights_and_one_put_right_is_no_other_settin
     assert status.remarks == ()
 
 
-def test_a_clock_that_is_wrong_hides_no_newer_night(plant, tmp_path):
-    history, robot = History(tmp_path / 'history'), plant[0]
-    day = timedelta(days=1)
-    settings = robot.settings_hash
-    about = {'kind': 'identify', 'verdict': 'accepted', 'chain': CHAIN}
-    row = Row('A', plants.when(0), '0', settings, 'a.csv', **about)
-    rows = [
-        replace(row, time=plants.when(k), filed=plants.when(k) + day / 4, inputs=str(k))
-        for k in range(4)
-    ]
-    ahead = replace(rows[2], time=plants.when(2000), source='b.csv')
-    for each in (*rows[:2], ahead, replace(rows[3], verdict='refused')):
-        history.file(each)
-    (status,) = statuses(plant[:1], history, Run(), 100.0)
-    assert status.state == 'refused'
-    assert status.remarks == (
-        '1 result with stamps later than the filing, on 2025-10-11 of 2031-04-01 (b.csv): set the '
-        'clock of the recorder',
-    )
-    back = {'time': plants.when(-900), 'filed': plants.when(4), 'source': 'c.csv'}
-    history.file(replace(row, verdict='refused', inputs='4', **back))
-    (status,) = statuses(plant[:1], history, Run(), 100.0)
-    assert status.remarks[1] == (
-        'c.csv was filed last, and its stamps are of 2023-04-23, before other nights: '
-        'unless it is an old one, a clock was set back'
-    )
-
-
-def test_a_robot_without_the_nights_of_the_others_is_told_of(plant, tmp_path):
-    history = History(tmp_path / 'history')
-    about = {'kind': 'identify', 'verdict': 'accepted', 'chain': CHAIN}
-    for robot, last in zip(plant[:2], (3, 7), strict=True):
-        for k in range(last + 1):
-            at = (plants.when(k), f'{robot.serial}{k}', robot.settings_hash)
-            history.file(Row(robot.serial, *at, filed=plants.when(k), **about))
-        remarks = [each.remarks for each in statuses(plant[:2], history, Run(), 100.0)]
-        if robot is plant[0]:
-            assert remarks == [(), ()]  # the newest, and one never measured
-    told = {each.robot.serial: each.remarks for each in statuses(plant[:2], history, Run(), 100.0)}
-    assert told == {'A': ('nothing measured since 2025-10-12; other robots were',), 'B': ()}
-    history.file(replace(history.rows('A')[-1], time=plants.when(4), inputs='late'))
-    assert not any(each.remarks for each in statuses(plant[:2], history, Run(), 100.0))
-
-
 def test_poses_verified_twice_count_once(plant, tmp_path):
     errors = {'rms_mm': 0.1, 'rms_freedom': 30.0}
     about = {'kind': 'verify', 'verdict': 'holds', 'chain': '{}'}
