@@ -88,4 +88,4 @@ class Row(Shown, Filing):
 
     def corrected(self) -> Chain:
         """Return the corrected chain with its frames."""
-        return parse_chain(self.chain, f'the chain of {self.serial} in the history')
+        return parse_chain(self.chain, f'the chain in {self.key}.parquet of the history')

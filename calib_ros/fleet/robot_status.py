@@ -15,6 +15,7 @@ from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.results import results, to_come, too_late, verifications
 from calib_ros.fleet.run import Run
 from calib_ros.fleet.watch import Watched, alarms_of, watch
+from calib_ros.identification.age import A_DAY
 from calib_ros.shown import counted, rounded, some
 
 
@@ -139,7 +140,7 @@ def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
     if not own:
         return
     newest = max(own, key=lambda row: row.filed)
-    if newest.time < own[-1].time and newest.filed.date() > own[-1].filed.date():
+    if newest.time < own[-1].time and newest.filed - own[-1].filed > A_DAY / 2:  # another run
         yield (
             f'{newest.source} was filed last, and its stamps are of {newest.time:%Y-%m-%d}, '
             'before other nights: unless it is an old one, a clock was set back'

@@ -16,6 +16,7 @@ from calib_ros.files.history import History
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.robot_status import RobotStatus
 from calib_ros.fleet.run import Run
+from calib_ros.identification.age import A_DAY
 from calib_ros.report.content import State
 from calib_ros.shown import some
 
@@ -54,17 +55,22 @@ def _silent(found: Sequence[RobotStatus]) -> Iterator[RobotStatus]:
 
     Of nights that one robot alone has, either the others or its own clock may be the reason.
     """
-    ends = sorted(one.last.time for one in found if one.last is not None)
+    usual: dict[str, timedelta] = {}
     for one in found:
         times = [night.row.time for night in one.watched.nights]
-        if len(ends) > 1 and one.last is not None and len(times) >= SEVERAL:
-            usual = max(median_low(b - a for a, b in pairwise(times)), timedelta(days=1))
-            last, newest, told = one.last.time, ends[-2], ''
-            if newest - last > SEVERAL * usual:
-                told = f'nothing measured since {last:%Y-%m-%d}; other robots were'
-            elif last - newest > SEVERAL * usual:
-                told = f'no other robot was measured since {newest:%Y-%m-%d}: is its clock ahead?'
-            one = replace(one, remarks=(*one.remarks, *filter(None, [told])))
+        if len(times) >= SEVERAL:
+            usual[one.robot.serial] = max(median_low(b - a for a, b in pairwise(times)), A_DAY)
+    ends = sorted(one.last.time for one in found if one.last and one.robot.serial in usual)
+    for one in found:
+        if one.last and one.robot.serial in usual and len(ends) > 1:
+            last, newest, few = one.last.time, ends[-2], SEVERAL * usual[one.robot.serial]
+            told: tuple[str, ...] = ()
+            if newest - last > few:
+                told = (f'nothing measured since {last:%Y-%m-%d}; other robots were',)
+            elif last - newest > few:
+                when = f'{newest:%Y-%m-%d}'
+                told = (f'no other robot was measured since {when}: is its clock ahead?',)
+            one = replace(one, remarks=(*one.remarks, *told))
         yield one
 
 
