@@ -128,7 +128,7 @@ def nights_part(folder, robots, nights, number, cluster):
             night, offsets = bumps.get(serial, (-9, {}))
             bumped = {name.partition('.')[0] for name in offsets}
             seen = (change.seen - plants.when(0)) / timedelta(days=1)
-            named = {*change.pair} or {each.owner for each in change.reasons[:1]} or {''}
+            named = {reason.owner for reason, *_ in change.changed} or {''}
             right = named <= bumped and night <= round(seen) <= night + 1
             said.append(f'{serial} night {round(seen)}: {change}; true: {night} {offsets}')
             if right:

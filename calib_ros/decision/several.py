@@ -27,6 +27,7 @@ from calib_ros.estimation.levels import SEVERAL
 from calib_ros.kinematics.parameter import Parameter
 
 Changes: TypeAlias = list[tuple[Explanation, ...]]
+ALL = 'all joints'  # owner of all zeros
 
 
 def one_by_one(reasons_beside: Callable[[Changes], tuple[Explanation, ...]]) -> Changes:
@@ -81,7 +82,7 @@ def likelier(
     best = max(tried, key=likely)
     if best is given:
         return changed
-    pairs = [(own[0].owner if len(own) == 1 else 'all joints', own) for own in best[len(kept) :]]
+    pairs = [(own[0].owner if len(own) == 1 else ALL, own) for own in best[len(kept) :]]
     rough = beside + [(explanation_of(information, columns, freedom, *pair),) for pair in pairs]
     found: Changes = []
     for k, reasons in enumerate(rough):
@@ -91,3 +92,19 @@ def likelier(
         )
         found.append(tuple(sizes))
     return found
+
+
+def names_of(changed: Sequence[Sequence[Explanation]]) -> list[Parameter]:
+    """Return the parameters that changes change, each by its best explanation."""
+    return [name for reasons in changed for name in reasons[0].names]
+
+
+def question(changed: Sequence[Sequence[Explanation]], *more: str) -> str:
+    """Return what to ask about changes: load, zeros, a collision, or `more`."""
+    first = [reason for reason, *_ in changed]
+    zeros = [each for each in first if [n.kind for n in each.names] in (['theta'], ['d'])]
+    if all(each.owner == LOAD for each in first):
+        return 'does it carry another one?'
+    if len(zeros) >= SEVERAL or ALL in {each.owner for each in first}:
+        return 'was it mastered again, or bumped?'
+    return f'{", or ".join(("was it bumped", *more))}?'

@@ -15,11 +15,11 @@ import calib_ros
 from calib_ros.atomic import write_file
 from calib_ros.errors import MOST_ENTRIES
 from calib_ros.files.rows import Row
+from calib_ros.fleet.change import Change
 from calib_ros.fleet.robot_status import RobotStatus
 from calib_ros.fleet.run import Run, page_path
 from calib_ros.fleet.status import STATES, counts
 from calib_ros.fleet.tasks import PLOTLY
-from calib_ros.fleet.watch import Change
 from calib_ros.report.page import NEEDS_JINJA, filled, plotly_script
 
 MOST_NIGHTS = MOST_ENTRIES // 10  # nights of a robot on the page; the history lists all

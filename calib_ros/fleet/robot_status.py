@@ -11,10 +11,11 @@ from calib_ros.apply.chart import Drift, drift
 from calib_ros.errors import CalibrationError
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
+from calib_ros.fleet.change import alarms_of
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.results import results, to_come, too_late, verifications
 from calib_ros.fleet.run import Run
-from calib_ros.fleet.watch import Watched, alarms_of, watch
+from calib_ros.fleet.watch import Watched, watch
 from calib_ros.identification.age import A_DAY
 from calib_ros.shown import counted, rounded, some
 

@@ -26,11 +26,9 @@ joints, or of all, are told instead if likelier (`several.py`).
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from datetime import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, NamedTuple, TypeAlias
 
@@ -42,79 +40,22 @@ from calib_ros.decision.changes import (
     LOAD,
     SCALES,
     ChangeColumns,
-    Explanation,
     Information,
-    changes_in_words,
     explanation_of,
-    reason_in_words,
     reasons_of,
 )
-from calib_ros.decision.several import Changes, likelier
+from calib_ros.decision.several import Changes, likelier, names_of
 from calib_ros.estimation.levels import CLEARLY, KNOWN, LARGEST_SCALE, SEVERAL, TELLING, chance_of
 from calib_ros.files.rows import Row
+from calib_ros.fleet.change import Change
 from calib_ros.identification.age import YEAR, drift_of
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.shown import counted, rounded, some
+from calib_ros.shown import counted, some
 
 LAGS = tuple(2**k for k in range(1 + TELLING))
 """Nights, 1 to 256, in which a change is sought: large ones show at once, small and slow ones
 later."""
-
-
-@dataclass(frozen=True, eq=False)
-class Change:
-    """A change of an arm."""
-
-    time: datetime  # of the first night after it
-    seen: datetime  # of the night of its detection
-    reasons: tuple[Explanation, ...] = ()  # most likely first; none if two or more joints changed
-    pair: tuple[str, ...] = ()  # the joints if two changed
-    zeros: Changes = field(default_factory=list)  # of SEVERAL joints or more
-    loaded: bool = False  # its night fitted gravity and no earlier one, or the other way round
-
-    def __str__(self) -> str:
-        if self.reasons and self.reasons[0].owner == LOAD:
-            return f'{reason_in_words(self.reasons)}: does it carry another one?'
-        asked = 'was it bumped' + ', or does it creep' * (self.seen > self.time)
-        asked += ', or does it carry another load' * self.loaded + '?'
-        if self.pair:
-            return f'two joints changed: {" and ".join(self.pair)}: {asked}'
-        if self.zeros:
-            return f'{changes_in_words(self.zeros)}: was it mastered again, or bumped?'
-        if not self.reasons:
-            return (
-                'several joints changed: was the robot repaired, or are these the measurements of '
-                'another robot?'
-            )
-        return f'{reason_in_words(self.reasons)}: {asked}'
-
-    @property
-    def alone(self) -> dict[tuple[Parameter, float], float]:
-        """Return the change [m, rad] of each parameter that may explain it alone, by its sign."""
-        single = ((e.names[0], float(e.change[0])) for e in self.reasons if len(e.names) == 1)
-        return {(name, math.copysign(1.0, change)): change for name, change in single}
-
-
-def alarms_of(changes: Sequence[Change]) -> Iterator[str]:
-    """Yield changes with their dates; SEVERAL of one parameter and sign in a row are creep."""
-    runs: list[list[Change]] = [[]]
-    for each in changes:
-        if not set(each.alone).intersection(*(one.alone for one in runs[-1])):
-            runs.append([])
-        runs[-1].append(each)
-    for run in filter(None, runs):
-        shared = set(run[0].alone).intersection(*(each.alone for each in run))
-        if not shared or len(run) < SEVERAL:
-            yield from (f'{each.time:%Y-%m-%d}: {each}' for each in run)
-            continue
-        factor, unit = min(shared)[0].small_unit
-        size = factor * sum(each.alone[min(shared)] for each in run)
-        names = ' or '.join(sorted(name for name, _ in shared))
-        yield (
-            f'{run[0].time:%Y-%m-%d}: {names} creeps: by {rounded(size, "+")} {unit} in '
-            f'{len(run)} changes up to {run[-1].time:%Y-%m-%d}: is it worn or loose?'
-        )
 
 
 class Night(NamedTuple):
@@ -197,10 +138,10 @@ def _compare_nights(fitted: Sequence[_Fitted], years: float) -> Watched:
             continue
         k = fresh + int(alarms[0])
         row = rows[first + k]
-        lag, reasons, pair, zeros = _cause(tests, k, level, row)
+        lag, changed = _cause(tests, k, level, row)
         before, known_up_to = bent[first : first + k + 1 - LAGS[lag]], first + k + 1
         first, loaded = first + len(before), bent[first + k] not in before
-        changes.append(Change(rows[first].time, row.time, reasons, pair, zeros, loaded))
+        changes.append(Change(rows[first].time, row.time, changed, loaded))
     nights = tuple(Night(row, each) for row, each in zip(rows, strengths, strict=True))
     newest = set(arms[-1])
     left = sorted(newest.union(*arms[first:]) - newest.intersection(*arms[first:]))
@@ -209,56 +150,52 @@ def _compare_nights(fitted: Sequence[_Fitted], years: float) -> Watched:
     return Watched(nights, tuple(changes), (remark,) if left else ())
 
 
-def _cause(
-    tests: _Tests, k: int, level: float, row: Row
-) -> tuple[int, tuple[Explanation, ...], tuple[str, ...], Changes]:
-    """Return the lag of an alarm in night k, and the joint, the pair or the zeros that changed.
-
-    None of these if others did.
-    """
+def _cause(tests: _Tests, k: int, level: float, row: Row) -> tuple[int, Changes]:
+    """Return the lag of an alarm in night k, and what changed; nothing if several joints did."""
     several = bool(tests.several[:, k].min() < level)
     shown = tests.several[:, k] if several else tests.chances[:, k].min(axis=1)
-    lag, pair = int(shown.argmin()), tuple[str, ...]()
-    one, two = np.split(tests.chances[lag, k], [len(tests.joints)])
-    if not several and two.min(initial=1.0) < level:
-        first, pair = tests.groups[int(one.argmin())], tests.groups[len(one) + int(two.argmin())]
-        if one.min() < level and _more_by_chance(tests, lag, k, first, pair) >= level:
-            pair = ()
-    columns, freedom = ChangeColumns(row.corrected(), tests.names), float(tests.freedom[k])
+    lag = int(shown.argmin())
     information = Information(tests.names, tests.weight[lag, k], tests.pull[lag, k])
+    columns, freedom = ChangeColumns(row.corrected(), tests.names), float(tests.freedom[k])
     reasons = reasons_of(information, columns, freedom, most=1.0)
+    pair = () if several else _pair(tests, lag, k, level, information)
     parts = ((joint, tuple(n for n in tests.names if n.owner == joint)) for joint in pair)
-    given: Changes = [(explanation_of(information, columns, freedom, *part),) for part in parts]
-    both = [name for each in given for name in each[0].names]
-    likely = [columns.evidence(information, own)[0] for own in (reasons[0].names, both) if own]
-    loaded = reasons[0].owner == LOAD and likely[0] >= max(likely)
-    told = [reasons] if loaded else likelier(information, columns, freedom, given or [reasons])
-    names = [name for each in told for name in each[0].names]
+    found: Changes = [(explanation_of(information, columns, freedom, *part),) for part in parts]
+    found = found or [reasons]
+    one, all_of = (columns.evidence(information, names_of(each))[0] for each in ([reasons], found))
+    loaded = reasons[0].owner == LOAD and one >= all_of
+    whole = [reasons] if loaded else likelier(information, columns, freedom, found)
+    names = names_of(whole)
     if loaded or (len(names) >= SEVERAL and {*names} <= {*columns.zeros}):
         every = np.eye(len(tests.names))
-        gain, whole = (information.explained(each)[0] for each in (columns.of(names), every))
-        left = (whole - gain) / CLEARLY**2
-        if chance_of(left, len(every) - len(names), freedom) >= level:
-            return (lag, reasons, (), []) if loaded else (lag, (), (), told)
-    return lag, () if several or pair else reasons, pair, []
+        gain, most = (information.explained(each)[0] for each in (columns.of(names), every))
+        if chance_of((most - gain) / CLEARLY**2, len(every) - len(names), freedom) >= level:
+            return lag, whole
+    return lag, [] if several else found
 
 
-def _more_by_chance(
-    tests: _Tests, lag: int, k: int, first: Sequence[str], pair: Sequence[str]
-) -> float:
-    """Return the chance that a pair of joints explains as much more than one joint.
+def _pair(
+    tests: _Tests, lag: int, k: int, level: float, information: Information
+) -> tuple[str, ...]:
+    """Return the two joints that changed in night k; none if one does not explain clearly less.
 
     Both with the scatter beside the pair: of two scatters only one may exceed chance.
     """
+    chances, size = tests.chances[lag, k], len(tests.joints)
+    if chances[size:].min(initial=1.0) >= level:
+        return ()
+    pair = tests.groups[size + int(chances[size:].argmin())]
+    if chances[:size].min() >= level:
+        return pair
+    joint = tests.groups[int(chances[:size].argmin())]
     owners, every = [name.owner for name in tests.names], np.eye(len(tests.names))
-    information = Information(tests.names, tests.weight[lag, k], tests.pull[lag, k])
     (one, *_, few), (two, *_, more), (whole, *_) = (
-        information.explained(every[:, np.isin(owners, group)]) for group in (first, pair, owners)
+        information.explained(every[:, np.isin(owners, group)]) for group in (joint, pair, owners)
     )
     others = len(owners) - more
     gain = (two - one) / float(_above_chance(np.asarray((whole - two) / others), others))
     known = min(float(tests.freedom[k]), others + len(owners) * (k - LAGS[lag]))
-    return chance_of(gain, more - few, known)
+    return pair if chance_of(gain, more - few, known) < level else ()
 
 
 class _Tests(NamedTuple):

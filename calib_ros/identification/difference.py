@@ -26,11 +26,11 @@ from calib_ros.annotated import as_annotated
 from calib_ros.decision import changes
 from calib_ros.decision.another import is_another
 from calib_ros.decision.changes import ChangeColumns, Explanation, Information
-from calib_ros.decision.several import likelier, one_by_one
+from calib_ros.decision.several import likelier, names_of, one_by_one, question
 from calib_ros.errors import InputError
 from calib_ros.estimation.gain import inverse_root
 from calib_ros.estimation.identifiability import structurally_independent
-from calib_ros.estimation.levels import CONFIDENT, SCALE, SEVERAL, chance_of
+from calib_ros.estimation.levels import CONFIDENT, SCALE, chance_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.posterior import size_group
 from calib_ros.estimation.sizes import TYPICAL
@@ -89,18 +89,9 @@ class Difference(Shown):
             )
         if known:
             reasons = changes.changes_in_words(self.changed)
-            why = 'is the arm warmer, or the device another?' if warmer else self._question()
+            why = 'is the arm warmer, or the device another?' if warmer else question(self.changed)
             return f'{reasons}; nothing else: {why} Predictions differ by {size}'
         return f'many parameters differ, by {size}: are both of one robot? Identify again'
-
-    def _question(self) -> str:
-        first = [reason for reason, *_ in self.changed]
-        zeros = [each for each in first if [n.kind for n in each.names] in (['theta'], ['d'])]
-        if all(reason.owner == changes.LOAD for reason in first):
-            return 'does it carry another one?'
-        if len(zeros) >= SEVERAL or 'all joints' in {reason.owner for reason in first}:
-            return 'was it mastered again, or bumped?'
-        return 'was it bumped?'
 
     def _repr_html_(self) -> str:
         return as_html(self.in_words(), (), (('parameter', 'change'), *self.rows()))
@@ -175,7 +166,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         float(np.sqrt(np.quantile(squares, CONFIDENT))),
         left,
         tuple(changed),
-        0.0 if another else _chance(left_over, freedom, sum(len(e[0].names) for e in changed)),
+        0.0 if another else _chance(left_over, freedom, len(names_of(changed))),
     )
 
 

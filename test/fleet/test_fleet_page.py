@@ -11,19 +11,20 @@ import plants
 from calib_ros.apply.chart import drift
 from calib_ros.decision.changes import Explanation
 from calib_ros.files.rows import Row
+from calib_ros.fleet.change import Change
 from calib_ros.fleet.page import fleet_page
 from calib_ros.fleet.plant import Pattern, Robot
 from calib_ros.fleet.robot_status import RobotStatus
 from calib_ros.fleet.run import Run
 from calib_ros.fleet.status import STATES, counts
-from calib_ros.fleet.watch import Change, Night, Watched
+from calib_ros.fleet.watch import Night, Watched
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.parameter import Parameter
 
 REASON = Explanation(
     '<b>', (Parameter('<b>', 'd'),), 100.0, 1e-20, 1.0, np.array([1e-4]), np.array([1e-5])
 )
-CHANGE = Change(plants.when(1), plants.when(1), (REASON,))
+CHANGE = Change(plants.when(1), plants.when(1), [(REASON,)])
 
 
 def status(serial, errors=None, changes=(), errors_mm=(0.1, 0.1, 0.1), **more):
