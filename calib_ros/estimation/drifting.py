@@ -85,32 +85,34 @@ def likelihoods(part: PartRows, kernel: FloatArray) -> tuple[FloatArray, FloatAr
     likely v.
     """
     basis, residual, known, shares = part
-    rows = np.concatenate([basis, residual[:, :, np.newaxis]], axis=2).transpose(2, 1, 0)
-    ratios, width = np.geomspace(0.02, 50.0, 12), len(rows)
+    rows = np.concatenate([basis, residual[:, :, np.newaxis]], axis=2)
+    ratios, width = np.geomspace(0.02, 50.0, 12), rows.shape[2]
     products, logs = np.zeros((len(ratios), width, width)), np.zeros(len(ratios))
     for seen in np.unique(known, axis=1).T:
         alike = (known == seen[:, np.newaxis]).all(axis=0)
         values, axes = np.linalg.eigh(kernel * np.outer(seen, seen))
         weights = 1.0 / (1.0 + np.outer(ratios, np.maximum(values, 0.0)))
-        turned = np.ascontiguousarray(rows[:, alike]) @ axes
+        turned = axes.T @ rows[:, alike].reshape(len(rows), -1)
         logs -= alike.sum() * np.log(weights).sum(axis=1)
-        products += [gram(np.sqrt(weight) * turned) for weight in weights]
+        roots = np.sqrt(weights)[:, :, np.newaxis]
+        products += [gram((root * turned).reshape(-1, width).T) for root in roots]
     count, others = known.sum(), np.eye(width - 1) - shares
     moved, free = np.einsum('ncp,nc->p', basis, residual), count - np.trace(shares)
     alone = (residual**2).sum() / free
     sizes = alone / (1.0 + ratios * np.diag(kernel).mean())
     likely = count * np.log(alone) - logs + free
     for k, (product, squares) in enumerate(zip(products, products[:, -1, -1], strict=True)):
-        own, along = product[:-1, :-1], product[:-1, -1]
+        own, along = product[:-1, :-1].copy(), product[:-1, -1]
         for left in reversed(range(1 + SEVERAL)):
             ratio = alone / sizes[k]
-            factor = lapack.dpotrf(own * ratio + others, lower=1)[0]
+            matrix = own * ratio + others  # symmetric: as Fortran has it, without a copy
+            factor = lapack.dpotrf(matrix.T, lower=1, overwrite_a=1)[0]
             vector = along * ratio - moved
             shift = lapack.dpotrs(factor, vector, lower=1)[0]
             if not left:
                 break
-            inverse = lapack.dpotri(factor, lower=1)[0]  # its lower triangle
-            taken = 2.0 * (inverse * own).sum() - np.diag(inverse) @ np.diag(own)
+            inverse = lapack.dpotri(factor, lower=1, overwrite_c=1)[0]  # its lower triangle
+            taken = 2.0 * np.vdot(inverse.T, own) - np.diag(inverse) @ np.diag(own)
             squared = squares - 2.0 * shift @ along + shift @ own @ shift
             sizes[k] = squared / max(count - ratio * taken, 1.0)
         likely[k] -= count * np.log(sizes[k]) + 2.0 * np.log(np.diag(factor)).sum()

@@ -30,7 +30,8 @@ def faded_near(
     own = np.diag(kernel) * (stride - stride**2)
     kernel = stride**2 * kernel + np.diag(own)
     rows = units.parts[part][:-1]
-    return np.asarray(np.einsum('pcn,rcn->pr', rows @ kernel, rows, optimize=True))
+    flat = rows.reshape(-1, len(kernel)) @ kernel
+    return flat.reshape(len(rows), -1) @ rows.reshape(len(rows), -1).T
 
 
 def faded_in_succession(
