@@ -83,8 +83,10 @@ def drop_unmeasured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
         told = f'{made.path}: the column valid says {_valid(made)[words.index(True)]!r} in '
         lines = lines_in_words(made.lines[words].tolist())
         notes.append(f'{told}{lines}, or another word: read all the same; 0 leaves out a row')
-    cells = {name: given for name, given in made.cells.items() if name != 'valid'}
-    return replace(made, cells=cells), tuple(notes)
+    if 'valid' in made.cells:  # otherwise the numbers are known
+        cells = {name: given for name, given in made.cells.items() if name != 'valid'}
+        made = replace(made, cells=cells)
+    return made, tuple(notes)
 
 
 def _valid(made: Columns) -> list[str]:

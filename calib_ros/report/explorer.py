@@ -128,10 +128,12 @@ def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
 
 def _quantiles(values: FloatArray, place: Index) -> list[Any]:
     """Return the SHARES (3, B) of values (N,) in bins (N,), None for empty ones."""
-    bins = (values[(place == k) & ~np.isnan(values)] for k in range(BANDS))
-    none = np.full(len(SHARES), np.nan)
-    table = [np.quantile(x, SHARES, method='nearest') if x.size else none for x in bins]
-    return numbers(np.transpose(table), 4)
+    known = np.flatnonzero(~np.isnan(values))
+    order = known[np.lexsort((values[known], place[known]))]
+    counts = np.bincount(place[known], minlength=BANDS)
+    rows = np.cumsum(counts) - counts + np.rint(np.outer(SHARES, counts - 1)).astype(int)
+    nearest = np.append(values[order], np.nan).take(rows, mode='clip')
+    return numbers(np.where(counts > 0, nearest, np.nan), 4)
 
 
 def _cells(poses: Poses) -> dict[str, Any]:

@@ -103,14 +103,15 @@ class Poses:
             names += [f'{when}_r{axis}' for when in WHEN for axis in 'xyz']
             blocks += [self.turned_before, self.turned_after]
         where = self.stamps_ns // 10**9 if self.by_line else self.stamps_ns
-        form = ','.join(['{:d},{:d},{},{:d},{:.3f}', *('{:.9f}' for _ in names[5:])])
+        form = ','.join(['%d,%d,%s,%d,%.3f', *('%.9f' for _ in names[5:])])
         parts = [','.join(names)]
         for first in range(0, len(self), BLOCK):
             rows = slice(first, first + BLOCK)
             heads = (where, self.set, self.role, self.outlier, self.size)
             columns = [each[rows].tolist() for each in heads]
             columns += np.column_stack([block[rows] for block in blocks]).T.tolist()
-            parts.append('\n'.join(map(form.format, *columns)).replace('nan', ''))
+            lines = map(form.__mod__, zip(*columns, strict=True))  # faster than str.format
+            parts.append('\n'.join(lines).replace('nan', ''))
             progress(min(1.0, rows.stop / len(self)))
         return '\n'.join([*parts, ''])
 
