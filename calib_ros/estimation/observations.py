@@ -327,6 +327,12 @@ class Observations(Shown):
         return configurations(self.joints, self.stops)
 
     @cached_property
+    def by_joint(self) -> tuple[FloatArray, FloatArray]:
+        """Return joint values (n, N), and their cosines and sines (2, n, N), for the solver."""
+        rows = np.ascontiguousarray(self.joints.T)
+        return rows, np.array(se3.cos_sin(rows))
+
+    @cached_property
     def stops(self) -> Index:
         """Return the stop number (N,) of each pair, in sequence."""
         return stops(self.joints)

@@ -44,7 +44,7 @@ class Samples:
     ) -> None:
         self.observations = self.moments = observations
         self.count = len(observations)
-        self.joints = np.ascontiguousarray(observations.joints.T)
+        self.joints, self._circle = observations.by_joint
         self.positions = np.ascontiguousarray(observations.positions.T)
         self.points = np.ascontiguousarray(observations.given.T) if observations.seen else None
         approach = observations.approach
@@ -149,9 +149,10 @@ class Samples:
                 out = None  # the last is shorter
             approach = None if self.approach is None else self.approach[:, part]
             moving = None if velocity is None else velocity[:, part]
+            circle = self._circle[:, :, part] if joints is self.joints else None
             points = None if self.points is None else self.points[:, part]
             axes, origin, *found, phi = model.linearise(
-                joints[:, part], approach, moving, out, points
+                joints[:, part], approach, moving, out, points, circle
             )
             out = found[0], found[1]
             shift = found[0]
@@ -288,6 +289,7 @@ def residual_arrays(chain: Chain, observations: Observations) -> Both:
     """
     turned = observations.oriented
     alike = observations.changed(covariance=None, oriented=np.full_like(turned, turned.any()))
+    vars(alike)['by_joint'] = observations.by_joint
     plain = Samples(alike, 1.0, 1.0)
     rows = plain.rows_of(chain, ())[0].T
     position = np.ascontiguousarray(rows[:, :3])

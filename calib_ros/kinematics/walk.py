@@ -36,6 +36,7 @@ class Walk:
     ) -> None:
         a, alpha, d, theta, self.beta, b = table.T
         self._theta = theta[:, np.newaxis]
+        self._turn = np.cos(self._theta), np.sin(self._theta)
         self.signs = signs[:, np.newaxis]
         self.turning = turning
         self._turns = turning[:, np.newaxis]
@@ -62,16 +63,25 @@ class Walk:
         return self.frames(q, base, found, ends), ends
 
     def frames(
-        self, q: FloatArray, base: FloatArray, found: FloatArray, ends: FloatArray | None = None
+        self,
+        q: FloatArray,
+        base: FloatArray,
+        found: FloatArray,
+        ends: FloatArray | None = None,
+        circle: FloatArray | None = None,
     ) -> FloatArray:
         """Write the frames of joints (before their motion) and flange to `found` (n + 1, 4, 3, B).
 
         At effective joint values (n, B), from T_world_base (4, 4). `ends` (n, 4, 3, B) receives
         the frames at the ends of the links of the modified convention; in the standard one these
-        are the following frames.
+        are the following frames. `circle` (2, n, B) are the cosines and sines of q, if known.
         """
         values = self.signs * q
-        cos, sin = cos_sin(self._theta + values * self._turns)
+        if circle is None or not self.turning.all():
+            cos, sin = cos_sin(self._theta + values * self._turns)
+        else:
+            (first, second), along, across = self._turn, circle[0], self.signs * circle[1]
+            cos, sin = first * along - second * across, second * along + first * across
         frame, turned = np.empty((4, *found.shape[2:])), np.empty((2, *found.shape[2:]))
         frame[:] = base[:3].T[..., np.newaxis]
         if self.standard:
