@@ -5,9 +5,9 @@
 Residual of a sample: p_measured - p and the rotation vector from the model's orientation to the
 measured one, both in world axes, weighted by the inverse covariance of the measurement; of a point
 seen from the flange, in the axes of the camera, as its covariance. Its derivative by the
-parameters is minus that of the error model. The orientation part omits the Jacobian of the
-logarithm, which leaves the residual itself unchanged: with equal weights on the three axes the
-gradient is the same. A measured distance has the residual L - |p|, and its derivative is the
+parameters is minus that of the error model. With equal weights on the three axes the orientation
+part omits the Jacobian of the logarithm, which leaves the residual itself, and the gradient, as
+they are. A measured distance has the residual L - |p|, and its derivative is the
 position's along p. Pixels of a board are in `pixels.py`.
 """
 
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.estimation.observations import Observations
+from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.kinematics.se3 import FloatArray, Index
@@ -172,6 +173,9 @@ class Samples:
             if self.oriented:
                 turn[-1] = orientation_error(self.rotations[:, :, part], axes)
             if self.whitening is not None:
+                if self.observations.covariance is not None:
+                    back = se3.left_jacobian_inverse(-turn[-1].T)
+                    turn[:-1] = np.einsum('bij,pjb->pib', back, turn[:-1], optimize=True)
                 both = np.concatenate([shift, turn], axis=1) * weights
                 whitening = self.whitening[:, :, part]
                 mixed = np.einsum('rsb,psb->prb', whitening, both, optimize=True)

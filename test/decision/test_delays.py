@@ -98,6 +98,14 @@ def test_of_stamps_that_jitter_errors_along_the_motion_count_for_less(oriented):
     assert timed(there)[1] == ()
 
 
+def test_nominal_arms_are_not_late_for_their_errors():
+    """Errors along the motion count for little: the delay crept, or hid the arm's errors."""
+    late = np.random.default_rng(4).normal(scale=0.01, size=(200, 1))
+    result = identify(Problem(UR10E, moving(200, late, errors=3.0), **SIGMAS))
+    assert result.converged
+    assert result.before.frame('base').delay == result.chain.frame('base').delay
+
+
 def test_stamps_that_jitter_are_no_drift():
     """All errors of a late pose belong together: counted singly, they were told as both."""
     for seed in range(3):

@@ -42,6 +42,20 @@ def test_weighted_rows_give_back_the_errors_in_metres(given):
     np.testing.assert_allclose(found[:, : expected.shape[1]], expected, rtol=1e-9)
 
 
+@KINDS
+def test_the_gradient_is_that_of_the_squares(given):
+    """With covariances and turns of degrees, fits ended beside the minimum: not converged."""
+    rng = np.random.default_rng(0)
+    seen = measure(arm(0), UR10E.random_joints(20, rng), rng, 1e-2, 0.3)
+    samples, names = Samples(given(seen), 3e-4, 7e-4), UR10E.parameter_names
+    *rows, left = samples.rows_of(arm(0), names)
+    for name, row in zip(names, rows, strict=True):
+        ends = (arm(0).with_offsets({name: step}) for step in (1e-6, -1e-6))
+        more, less = ((samples.rows_of(chain, ())[-1] ** 2).sum() for chain in ends)
+        expected = -2.0 * (row * left).sum()
+        assert (more - less) / 2e-6 == pytest.approx(expected, rel=1e-5, abs=1e-5 * more)
+
+
 @pytest.mark.parametrize('weighted', [False, True])
 @KINDS
 def test_products_of_effects_are_those_of_their_rows(given, weighted, monkeypatch):
