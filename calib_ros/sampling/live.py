@@ -11,6 +11,7 @@ import numpy as np
 from calib_ros.errors import CalibrationError
 from calib_ros.estimation.configurations import configurations, count_distinct
 from calib_ros.estimation.fitting import SOME
+from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.sampling.estimate import Estimate, Update
@@ -30,6 +31,8 @@ class LiveEstimate:
     def __init__(self, problem_of: Callable[[Sequence[Sample]], Problem]) -> None:
         self._problem_of = problem_of
         self._seen: list[Sample] = []
+        self._structure: tuple[object, ...] = ()
+        self._names: tuple[str, ...] = ()
         self.known = Update()  # by the last update
 
     def update(self, samples: Sequence[Sample]) -> Estimate | None:
@@ -48,9 +51,19 @@ class LiveEstimate:
         except CalibrationError as err:
             return Update(refused=str(err))
         try:
-            return live_fit(problem, some, len(samples))
+            return live_fit(problem, self._independent(problem), some, len(samples))
         except (CalibrationError, np.linalg.LinAlgError):
             return Update()
+
+    def _independent(self, problem: Problem) -> tuple[str, ...]:
+        """Return what many poses would determine, found anew only if it may be something else."""
+        ways = ((s.socket, s.plane, s.seen, s.width, s.moving) for s in problem.sets)
+        ends = ((each.base, each.tool) for each in problem.sets)
+        structure = problem.chain, problem.free, *ends, *ways
+        if structure != self._structure:
+            self._names = structurally_independent(problem.model, problem.free, problem.sets)
+            self._structure = structure
+        return self._names
 
 
 def _spread(samples: Sequence[Sample]) -> list[Sample]:

@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.estimation.gross_errors import chance_of_outliers, thorough_fit
-from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
 from calib_ros.estimation.levels import SURE
 from calib_ros.estimation.normal import normal_equations
@@ -38,9 +37,13 @@ WIDE = (Settings.largest_length / 5.0, Settings.largest_angle / 5.0)
 """Prior standard deviations [m, rad] of arm parameters: five times as much is another robot."""
 
 
-def live_fit(problem: Problem, samples: Sequence[Sample], count: int) -> Update:
-    """Return what some samples, which make the problem, tell of all `count` samples."""
-    names = structurally_independent(problem.model, problem.free, problem.sets)
+def live_fit(
+    problem: Problem, names: tuple[str, ...], samples: Sequence[Sample], count: int
+) -> Update:
+    """Return what some samples, which make the problem, tell of all `count` samples.
+
+    `names` are of the parameters that many poses would determine.
+    """
     system = replace(problem.system(problem.sets), prior=_priors(problem, names))
     spare = system.rows - len(names)  # the wide priors restrict nothing
     loss = 'redescending' if spare > len(names) else 'none'

@@ -233,6 +233,15 @@ def test_nothing_is_computed_again_without_a_new_sample(rng):
     assert asked == [20, 19, 20]
 
 
+def test_another_kind_of_samples_is_another_structure(rng):
+    """What many poses would determine is found anew for them alone."""
+    true = faulty(UR10E, Cell(), rng)
+    points, poses = seen(true, 12, rng, oriented=False), seen(true, 12, rng, start=20)
+    every, live = points + poses, LiveEstimate(session().problem_of)
+    counts = [len(live.update(every[:k]).names) for k in (10, 12, 13, 24, 10)]
+    assert counts == [27, 27, 30, 30, 27]
+
+
 def test_joints_that_hardly_moved_are_named():
     held = Joint('held', lower=0.0, upper=0.0)
     chain = Chain('arm', 'standard', (Joint('a'), Joint('b'), Joint('c', 'prismatic'), held))
