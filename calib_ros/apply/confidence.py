@@ -34,14 +34,15 @@ def rms_limits(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the limits (N,) of the interval of an RMS with (N,) degrees of freedom.
 
-    Beyond each limit lies half of what the interval may miss; the upper one may be inf.
+    Beyond each limit lies half of what the interval may miss; the upper one may be inf, and is
+    below one degree of freedom: fewer bound nothing.
     """
     with np.errstate(divide='ignore'):
         lower, upper = (
             rms / np.sqrt(special.chdtri(freedom, miss) / freedom)
             for miss in (0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence)
         )
-    return lower, upper
+    return lower, np.where(freedom < 1.0, np.inf, upper)
 
 
 def rms_interval(errors: FloatArray, group: Index, together: float = 1.0) -> tuple[float, float]:

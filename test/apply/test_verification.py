@@ -154,6 +154,8 @@ def test_limits_are_those_of_the_chi_squared_distribution():
     squares = rng.chisquare(15.0, 100_000) / 15.0
     assert np.mean(squares < 1.0 / upper[0] ** 2) == pytest.approx(0.05, abs=0.005)
     assert np.mean(squares > 1.0 / lower[0] ** 2) == pytest.approx(0.05, abs=0.005)
+    few = rms_limits(1.0, np.array([0.9, 1.0, 1.1]), 0.95)[1]
+    assert list(np.isinf(few)) == [True, False, False]  # an upper limit of 1e52 mm was reported
 
 
 def test_repeatability_is_that_of_the_standard():
