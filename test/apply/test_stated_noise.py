@@ -19,6 +19,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibration import recalibrate
+from calib_ros.kinematics.effects import members
 from calib_ros.kinematics.joint import Frame
 from calib_ros.kinematics.se3 import norms
 from calib_ros.report.documents import verification_document
@@ -42,9 +43,10 @@ def test_a_device_with_more_noise_does_not_condemn_the_arm(cell, arm):
     slipped = cell[0].with_offsets({'elbow_joint.theta': 1.5e-3})
     moved = measured(slipped, seen.joints, 1, (noise, 1e-3))
     for given in ({'sigma_position': noise}, {}):
-        assert verify(arm, [moved], None, **given).verdict == 'does not hold'
+        found = verify(arm, [moved], None, **given)  # where it decides nothing it is not told
+        assert (found.verdict, found.noise) == ('does not hold', 0.0)
     few = measured(cell[0], seen.joints, 1)
-    for sigma in (Settings.sigma_position, noise):  # where it decides nothing it is not told
+    for sigma in (Settings.sigma_position, noise):
         same = verify(arm, [few], None, sigma_position=sigma)
         assert (same.verdict, same.noise) == ('holds', 0.0)
 
@@ -75,18 +77,26 @@ def test_an_option_is_known_to_be_given_though_it_has_the_value_of_the_default()
 
 
 @pytest.mark.parametrize(
-    'changed',
-    [
-        {'elbow_joint.ratio': 1e-3},
-        {'shoulder_lift_joint.sin_1': 1e-3, 'elbow_joint.cos_2': 1e-3},
-        {'wrist_2_joint.coupling_wrist_1_joint': 3e-3},
-        {'elbow_joint.gravity_wrist_3_joint': 2e-3},
-    ],
+    ('count', 'worn', 'bent'), [(10, 3e-4, 0.0), (10, 0.0, 2e-4), (20, 2e-4, 2e-4)]
 )
-def test_an_arm_that_changed_in_more_than_its_shape_is_no_noise_of_the_device(cell, arm, changed):
-    """Of worn drives, and of another load, the device was said to have too much noise."""
-    true, q = cell[0].with_effect_values(changed), UR.random_joints(30, np.random.default_rng(3))
+def test_an_arm_that_changed_in_more_than_its_shape_is_no_noise_of_the_device(
+    cell, arm, count, worn, bent
+):
+    """Of worn drives, bent links, or both, the device was said to have too much noise."""
+    rng = np.random.default_rng(0)
+    links = [name for name in UR.parameter_names if name.of_dh]
+    changed = {name: worn * rng.choice([-1, 1]) for name in members(UR, 'ratio')}
+    true = cell[0].with_effect_values(changed)
+    true = true.with_offsets({name: bent * rng.choice([-1, 1]) for name in links})
+    q = UR.random_joints(count, np.random.default_rng(3))
     assert verify(arm, [measured(true, q, 1)], None).verdict == 'does not hold'
+
+
+def test_a_joint_that_slips_more_and_more_is_no_noise_of_the_device(cell, arm):
+    rng = np.random.default_rng(1)
+    q = UR.random_joints(30, rng)
+    slips = 3e-4 * np.cumsum(rng.normal(size=(30, 1)), axis=0) * np.eye(6)[2]
+    assert verify(arm, [replace(measured(cell[0], q + slips, 1), joints=q)], None).failed
 
 
 @pytest.mark.parametrize('seed', range(2))
