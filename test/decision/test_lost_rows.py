@@ -202,10 +202,10 @@ def test_a_joint_that_repeats_its_value_while_others_move_is_named(
     (told,), _ = frozen_joints(fitting.fit(problem))
     where = 'poses of 14.000 s to 18.000 s' if of_messages else 'lines 14 to 18'
     assert told.startswith(f'{chain.joint_names[joint]} moved in {where}, but its values repeat')
-    assert identify(problem).remarks[0] == told
     bumped = np.pad([[1e-3]], ((0, 0), (0, 2))) * (np.arange(40) >= 20)[:, np.newaxis]
     moved = replace(seen, joints=joints, positions=seen.positions + bumped)
-    found = identify(Problem(chain, moved, **SIGMAS))
+    found = identify(replace(problem, observations=moved))
+    assert found.remarks[0] == told
     assert found.step.sample == 20  # and it is not hidden
 
 

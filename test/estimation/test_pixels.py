@@ -267,7 +267,7 @@ def test_pixels_without_a_lens_are_refused():
 
 def test_corners_and_a_table_by_the_command_line(run, tmp_path, rng):
     """Corners of a board of 7 x 5 squares, alone and beside a tracker's poses."""
-    true, seen = scene(5, True)
+    true, seen = scene(5, True, 18)
     write_images(tmp_path, seen, CAMERA.lens, 0.04)
     tracked = replace(true, base=Frame(), tool=Frame())
     poses = measure(tracked, UR.random_joints(20, rng), rng, 5e-5, 2e-4)
@@ -278,12 +278,12 @@ def test_corners_and_a_table_by_the_command_line(run, tmp_path, rng):
     status, out, _ = run(*given)
     alone = json.loads(out)
     assert (status, alone['rank']) == (0, 30)
-    assert alone['samples'] == {'samples': 720, 'held_out': 0, 'sets': 1, 'images': 30}
+    assert alone['samples'] == {'samples': 432, 'held_out': 0, 'sets': 1, 'images': 18}
     assert alone['validation']['after']['rms_px'] < 0.5
     status, out, _ = run(*given, '--csv', 'poses.csv', '--sigma-position', '5e-5')
     both = json.loads(out)
     assert (status, both['rank']) == (0, 42)
-    assert both['samples'] == {'samples': 740, 'held_out': 0, 'sets': 2, 'images': 30}
+    assert both['samples'] == {'samples': 452, 'held_out': 0, 'sets': 2, 'images': 18}
     assert 'tool_camera.x' in both['parameters']
     for more, said in (
         (('ur5e',), 'needs --board'),
@@ -342,10 +342,9 @@ def test_the_mistake_comes_first_where_the_fit_does_not_end_well():
     assert words in str(result.refusals[0])
 
 
-@pytest.mark.parametrize(('kind', 'count'), [('degrees', 30), ('shift', 12)])
-def test_a_fit_that_runs_away_is_told_in_figures(kind, count, unsearched):
-    _, seen = scene(1, False, count)
-    wrong = replace(seen, **MISTAKES[kind][0](seen))
+def test_a_fit_that_runs_away_is_told_in_figures(unsearched):
+    _, seen = scene(1, False)
+    wrong = replace(seen, **MISTAKES['degrees'][0](seen))
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         result = identify(Problem(known(wrong.on_flange), wrong, sigma_pixel=SIGMA))

@@ -138,8 +138,8 @@ def test_a_night_whose_file_was_put_right_counts_once(unsearched, plant, cluster
     history, place = History(tmp_path / 'history'), tmp_path / 'nights/A/001.csv'
     right = place.read_text()
     head, *lines = (line.split(',') for line in right.splitlines())
-    in_mm = [[*row[:7], *(str(1e3 * float(x)) for x in row[7:10]), *row[10:]] for row in lines]
-    place.write_text('\n'.join(','.join(row) for row in (head, *in_mm)))
+    off = [[*row[:7], *(str(1.05 * float(x)) for x in row[7:10]), *row[10:]] for row in lines]
+    place.write_text('\n'.join(','.join(row) for row in (head, *off)))
     found = run(plant, history, cluster)
     assert statuses(plant, history, found, 100.0)[0].state == 'refused'
     place.write_text(right)
