@@ -162,7 +162,7 @@ def test_every_measurement_is_accounted_for(plan, traffic):
             take(session, *come)
             come = []
             call(session, name)
-        if k % 100 == 0 or name in CALLS:
+        if k % 200 == 0 or name in CALLS:
             take(session, *come)
             come = []
             came, found = balance(session)

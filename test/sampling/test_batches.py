@@ -21,7 +21,7 @@ GRIPPER = Stream('gripper', JOINT_STATE)
 TRACKER = Stream('tracker', POSE, Source('tracker', POSE))
 CAMERA = Stream('camera', POINT, Source('camera', POINT, device='camera'))
 START = 1_700_000_000_000_000_000
-RARE = 0.002
+RARE = 0.003
 
 
 def written(stream, message):
@@ -42,7 +42,7 @@ def point(stamp_ns, position):
 
 def shift(rng, stops=3):
     """Return messages of a shift with what may go wrong, in the order in which they come."""
-    cell = Cell(joint_rate=100.0, move=0.7, dwell=0.6)
+    cell = Cell(joint_rate=64.0, move=0.7, dwell=0.6)
     true = faulty(ARM, Cell(), rng)
     stamps, values, _ = drive(ARM.random_joints(stops, rng), cell, START)
     seen = measure(true, values, rng, 5e-5, 2e-4)
