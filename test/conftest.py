@@ -63,22 +63,25 @@ def run(capsys, tmp_path, monkeypatch):
     return run
 
 
+@pytest.fixture(scope='session', autouse=True)
+def png_of():
+    """Leave PNG files empty: to draw one takes longer than to identify. Return what draws.
+
+    Nor does a command say how long it takes on a busy machine.
+    """
+    from calib_ros.report import plots
+
+    known = plots.png_of
+    with pytest.MonkeyPatch.context() as always:
+        always.setattr(plots, 'png_of', lambda figure: b'')
+        always.setattr('calib_ros.cli.screen.EVERY_S', 1e6)
+        yield known
+
+
 @pytest.fixture
-def drawn():
+def drawn(monkeypatch, png_of):
     """Let pictures be drawn."""
-
-
-@pytest.fixture(autouse=True)
-def undrawn(request, monkeypatch):
-    """Let the other tests leave PNG files empty: to draw one takes longer than to identify."""
-    if 'drawn' not in request.fixturenames:
-        monkeypatch.setattr('calib_ros.report.plots.png_of', lambda figure: b'')
-
-
-@pytest.fixture(autouse=True)
-def no_signs_of_life(monkeypatch):
-    """Keep lines that tell how long a command takes, on a busy machine, from its output."""
-    monkeypatch.setattr('calib_ros.cli.screen.EVERY_S', 1e6)
+    monkeypatch.setattr('calib_ros.report.plots.png_of', png_of)
 
 
 def pytest_collection_finish():
