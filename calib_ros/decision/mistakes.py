@@ -66,9 +66,10 @@ def with_mistake(problem: Problem, result: Identification) -> Identification:
     """Return the result with the mistake that explains its errors, if any.
 
     It becomes the first refusal, in place of those that follow from it with the same advice: a
-    held frame found wrong by the misfit, or no gain beyond the uncertainty. But another arm, and
-    orientations that do not fit, only give a remark if nothing else refuses the result. A move
-    that leaves one side out explains all if the arm fits both: it comes first then.
+    held frame found wrong by the misfit, or no gain beyond the uncertainty. Remarks are those of a
+    fit that explains nothing: it replaces them, too. But another arm, and orientations that do not
+    fit, only give a remark if nothing else refuses the result. A move that leaves one side out
+    explains all if the arm fits both: it comes first then.
     """
     found, step = None, result.step
     if _suspicious(problem, result):
@@ -80,7 +81,7 @@ def with_mistake(problem: Problem, result: Identification) -> Identification:
     if result.refusals or found.alone:
         follow = (Rule.MISTAKE, Rule.REGION)
         others = (each for each in result.refusals if each.rule not in follow)
-        return replace(result, refusals=(found.reason, *others))
+        return replace(result, refusals=(found.reason, *others), remarks=())
     return replace(result, remarks=(str(found), *result.remarks))
 
 
@@ -223,7 +224,9 @@ def _named(
 ) -> Diagnosis | None:
     """Return the mistakes that explain the measurements best.
 
-    With `inexact` the arm may be worse than faulty ones, if a tenth of the error is left at most.
+    Of those that explain a usual share of the samples alike the ones that also explain the rest:
+    where one joint moves at a time, few rows show a mistake in it. With `inexact` the arm may be
+    worse than faulty ones, if a tenth of the error is left at most.
     """
     most = EXCEPTION * min(given.share, 1.0) if inexact else 0.0
     # an arm in mm fits places in mm, and is off by metres
@@ -233,9 +236,11 @@ def _named(
     best, least = good[0][0], good[0][0].share
     if best.error > NEARER * given.error or least > NEARER * min(given.share, 1.0):
         return None
-    named = [each for one, each in good if one.share <= ALIKE * least]
-    lowest = min(each.rank for each in named)
-    named = [each for each in named if each.rank == lowest]
+    alike = [x for x in good if x[0].share <= ALIKE * least]
+    all_of_it = ALIKE * min(one.whole for one, _ in alike)
+    alike = [x for x in alike if x[0].whole <= all_of_it]
+    lowest = min(each.rank for _, each in alike)
+    named = [each for _, each in alike if each.rank == lowest]
     named += [each for one, each in good if ALIKE * least < one.share <= least / NEARER]
     unlike = {(each.what, each.remedy): each for each in named}
     return Diagnosis(tuple(unlike.values())[:SEVERAL], given.error, best.error)

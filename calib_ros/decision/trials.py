@@ -62,14 +62,22 @@ class Trial:
     @cached_property
     def error(self) -> float:
         """Return the error [m] that a usual share of the samples is within."""
-        pairs = zip(self.sets, self.arms, strict=True)
-        sizes = [sample_errors(self.chain, each, arm) for each, arm in pairs]
-        return float(_usual(np.concatenate(sizes)))
+        return float(_usual(self._sizes))
+
+    @property
+    def whole(self) -> float:
+        """Return the RMS error of all samples in units of the spread."""
+        return float(np.sqrt(np.mean(self._sizes**2))) / max(self.spread, 1e-9)
 
     @property
     def share(self) -> float:
         """Return the error in units of the spread."""
         return self.error / max(self.spread, 1e-9)
+
+    @property
+    def _sizes(self) -> FloatArray:
+        pairs = zip(self.sets, self.arms, strict=True)
+        return np.concatenate([sample_errors(self.chain, each, arm) for each, arm in pairs])
 
 
 def trial_of(chain: Chain, sets: Sets) -> Trial:

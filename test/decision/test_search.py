@@ -139,7 +139,7 @@ def searched(monkeypatch):
     def search(options, shares, pairs=()):
         def trials_of(tried):
             found = [shares.get(''.join(sorted(sets[0])), 1.0) for _, sets in tried]
-            return [SimpleNamespace(share=share, error=share) for share in found]
+            return [SimpleNamespace(share=share, error=share, whole=share) for share in found]
 
         suspects = [
             Suspect(

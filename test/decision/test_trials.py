@@ -7,10 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import NOISE, UR10E, measured_arm
+from fits import NOISE, UR10E, arm, measured_arm
 
 from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.decision.mistakes import diagnose
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.trials import (
     Trial,
@@ -53,9 +54,9 @@ def test_trials_at_once_are_those_one_by_one():
     kinds = (seen, placed.inverted(), seen.select(np.arange(4, 22)), replace(seen, tool='tool_B'))
     turned = [replace(each, joints=each.joints + 0.1 * k) for k in range(3) for each in kinds]
     cases = [(chain, (turned[k], turned[k - 1])) for k in range(0, 12, 2)]
-    cases += [(arm, (each,)) for arm in (chain, UR10E) for each in turned]
-    for (arm, sets), found in zip(cases, trials_of(cases), strict=True):
-        alone = trial_of(arm, sets)
+    cases += [(one, (each,)) for one in (chain, UR10E) for each in turned]
+    for (tried, sets), found in zip(cases, trials_of(cases), strict=True):
+        alone = trial_of(tried, sets)
         assert (found.error, found.share) == pytest.approx((alone.error, alone.share), rel=1e-9)
         assert Trial(found.chain, sets, found.arms).error == pytest.approx(found.error, rel=1e-9)
 
@@ -90,6 +91,30 @@ def test_gross_errors_do_not_spoil_the_refinement():
     for trial in (rough, turned):
         found = refine_trial(Problem(UR10E, seen, sigma_position=NOISE[0]), trial)
         assert sample_errors(found.chain, seen, arm)[8:].max() < 1e-6
+
+
+def coupled(chain, seed, home=None):
+    """Return an arm measured joint by joint, the third one given less the second."""
+    rng, turns = np.random.default_rng(seed), np.linspace(-0.7, 0.8, 10)
+    true = arm(rng, chain=chain)
+    home = chain.random_joints(1, rng) if home is None else home
+    joints = home + np.kron(np.eye(6), turns[:, np.newaxis])
+    seen = measure(true, joints, rng, *NOISE, oriented=False)
+    less = joints[:, 2:3] - joints[:, 1:2]
+    return Problem(chain, replace(seen, joints=np.hstack([joints[:, :2], less, joints[:, 3:]])))
+
+
+@pytest.mark.parametrize('seed', [0, 3, 8])
+def test_the_mistake_of_a_joint_that_moves_in_few_rows_is_named(seed):
+    """A usual share lies within joints moved one by one: in 3 of 16 arms another was named."""
+    assert 'they are coupled' in str(diagnose(coupled(UR10E, seed)))
+
+
+def test_beside_a_mistake_nothing_else_is_remarked():
+    """The target was said to have moved by 710 mm, and the device by 75 mm."""
+    home = np.array([0.4, 0.3, -0.1, -1.4, -0.1, 1.0])
+    result = identify(coupled(load_chain('fanuc_r2000ic_165f'), 2, home))
+    assert (result.refusals[0].rule, result.remarks) == (Rule.MISTAKE, ())
 
 
 def test_two_sessions_in_one_are_no_mistakes():
