@@ -10,7 +10,7 @@ With the wanted RMS error as limit, and the interval of `confidence.py`, it is
 
 Of a device with more noise than that of the calibration, the excess is no error of the arm: it
 does not hold only if the interval without it is beyond the limit. Noise that nobody states is
-that of `device_noise.py`.
+that of `device_noise.py`, at most `largest_error`: rows in another order look like noise, too.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import Index
+from calib_ros.settings import Settings
 from calib_ros.shown import rounded
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
@@ -179,7 +180,7 @@ def _noise_beyond(
     problem = Problem(arm.before, sets[0], more=sets[1:])  # the earlier device
     then = now = arm.noise.expected_in(problem).sigma_position
     if guessed:
-        now = max(now, noise_seen(chain, guessed))
+        now = max(now, min(noise_seen(chain, guessed), Settings.largest_error))
     elif stated is not None:
         problem = replace(problem, sigma_position=stated)
         now = arm.noise.expected_in(problem, ('sigma_position',)).sigma_position

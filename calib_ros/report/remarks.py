@@ -10,7 +10,8 @@ import numpy as np
 
 from calib_ros.apply.judgement import DECIDING
 from calib_ros.apply.verified import Verification
-from calib_ros.estimation.levels import NEARER
+from calib_ros.decision.comparison import log_gain
+from calib_ros.estimation.levels import CERTAIN, NEARER
 from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.kinematics.se3 import norms
 from calib_ros.report.words import interval_mm, turned_in_words
@@ -114,7 +115,7 @@ def causes(found: Verification) -> list[str]:
         lines.append(
             _odd_in_words(found) if found.odd else 'put right what moved, and measure again'
         )
-    elif (found.common if found.common < NEARER else 1.0) * rms > largest:
+    elif (found.common if found.common < NEARER else 1.0) * rms > largest and not _fits(found):
         lines.append(
             'no arm is that far off: check the units and columns of the measurements (--length, '
             '--joint-angle, --columns), their rows, the robot, and whether the device '
@@ -128,6 +129,16 @@ def causes(found: Verification) -> list[str]:
             'what moved'
         )
     return lines
+
+
+def _fits(found: Verification) -> bool:
+    """Tell whether the correction lowers the error: then the rows are of this arm.
+
+    By less than chance, or by a correction that hardly counts beside the error, proves nothing.
+    """
+    before, after = found.comparison.before.position, found.comparison.after.position
+    gain, chance = log_gain(before, after, found.group, CERTAIN)
+    return gain > chance and bool(NEARER * np.linalg.norm(after) < np.linalg.norm(before - after))
 
 
 def _wanted(found: Verification) -> str:

@@ -228,6 +228,18 @@ def test_units_are_named_though_a_common_motion_would_take_most_of_the_error(arm
     assert 'no arm is that far off' not in in_words(verify(arm, [coarse], 1.5e-2))  # as wanted
 
 
+@pytest.mark.parametrize(('known', 'told'), [(-0.04, False), (0.0, True)])
+def test_an_arm_that_is_far_off_by_itself_has_no_wrong_units(arm, known, told):
+    """A robot 28 mm off, 17 mm with zeros set anew, was told that no arm is that far off."""
+    far = replace(arm, before=arm.chain.with_offsets({'elbow_joint.theta': known}))
+    moved = arm.chain.with_offsets({'elbow_joint.theta': 0.04})
+    seen = measured(moved, UR.random_joints(20, np.random.default_rng(0)), 1)
+    found = verify(far, [seen], None, new_base=True, new_tool=True)
+    assert found.failed
+    assert found.rms > 0.01
+    assert ('no arm is that far off' in in_words(found)) is told
+
+
 def test_one_pose_that_alone_exceeds_the_limit_is_named(arm):
     errors = np.random.default_rng(0).normal(scale=1e-5, size=(9, 3))
     errors[4] += [0.0, 0.01, 0.0]
