@@ -350,7 +350,8 @@ def _of_signs(chain: Chain) -> Iterator[Suspect]:
         if joints != [*chain.joints]:
             of = chain.joint_names[which[0]] if len(which) == 1 else 'all joints'
             what = f'{kind} of {of} has the other sign'
-            remedy = f'correct {kind} in the chain file'
+            whose = 'the same' if kind == 'd' else 'the next'
+            remedy = f'correct {kind} in the chain file (in a URDF: origin of {whose} joint)'
             arm = replace(chain, joints=tuple(joints), parallel=None)
             yield Suspect(what, remedy, rank=2, chain=arm, published=remedy)
 

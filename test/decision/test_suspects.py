@@ -352,7 +352,7 @@ def test_a_wrong_sign_in_the_dh_table_is_named(kind, which, accepted, rng, singl
     problem = Problem(wrong, seen)
     said = identify(problem).remarks[0] if accepted else str(diagnose(problem))
     of = which[0] if len(which) == 1 else 'all joints'
-    assert f'{kind} of {of} has the other sign: correct {kind} in the chain file' in said
+    assert f'{kind} of {of} has the other sign: correct {kind} in the chain file (in a U' in said
 
 
 def test_signs_and_zeros_to_set_in_the_chain_file_do_what_the_columns_do(rng):
