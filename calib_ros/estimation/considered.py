@@ -11,7 +11,7 @@ from itertools import compress
 import numpy as np
 
 from calib_ros.estimation.levels import LARGEST_SCALE, OUT_OF_SCALE, PRINTED, SCALE
-from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.observations import Observations, sided
 from calib_ros.estimation.system import System
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -32,14 +32,15 @@ def considered(
 
     DH parameters held at nominal by a `fixed` pattern may be off as well, and frames held by the
     chain file. Where eccentricity is fitted, waves of other orders look like it in part of a turn.
-    Joints may have play, of which only `sets` with signs of the last moves tell anything.
+    Joints may have play, of which `sets` tell: of joints from both sides, or with stated signs.
     """
     every = [name for group in CONSIDERED for name in effects.members(chain, group)]
     every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
     every += travels(chain)
-    signs = [each.approach for each in sets if each.approach is not None]
-    if signs:
-        known = np.abs(np.concatenate(signs)).max(axis=0)
+    if sets:
+        stated = [each.approach.any(axis=0) for each in sets if each.approach is not None]
+        signs = np.concatenate([each.approach for each in sided(sets)])
+        known = np.any([signs.min(axis=0) * signs.max(axis=0) < 0.0, *stated], axis=0)
         every += compress(effects.members(chain, 'backlash'), known)
     fitted = [name for name in effects.members(chain, 'eccentricity') if name in names]
     for owner in dict.fromkeys(name.owner for name in fitted):

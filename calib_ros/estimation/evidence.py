@@ -140,6 +140,7 @@ class _Columns:
         beside = {name: std for name, std in given.rounding.items() if name in names}
         whole, lengths, self.scale = self.chain, dict[str, float](), SCALE
         if seen:
+            system = system.sided()
             whole, lengths, self.scale = lengths_of(self.chain, system)
         strained &= bool(lengths)
         noise = max(given.noise, HALF_THE_DIGITS)  # parameters that follow all exactly leave none

@@ -365,6 +365,24 @@ def numbered(sets: Sequence[Observations]) -> tuple[Index, ...]:
     return tuple(np.split(numbers, np.cumsum([len(each) for each in sets])[:-1]))
 
 
+def sided(sets: Sequence[Observations]) -> tuple[Observations, ...]:
+    """Return sets with signs of the last moves, as if straight from stop to stop if unknown.
+
+    Joints come to their largest values from below: play so depends on them even in random order.
+    """
+    joints = np.concatenate([each.joints for each in sets])
+    order = np.argsort(np.concatenate([s.stamps_ns for s in sets]), kind='stable')
+    moves = np.diff(joints[order], axis=0, prepend=joints[order[:1]])
+    last = np.where(np.abs(moves) > STILL, np.arange(len(moves))[:, np.newaxis], 0)
+    signs = np.empty_like(joints)
+    signs[order] = np.sign(np.take_along_axis(moves, np.maximum.accumulate(last), axis=0))
+    parts = np.split(signs, np.cumsum([len(each) for each in sets])[:-1])
+    return tuple(
+        each if each.approach is not None and each.approach.any() else replace(each, approach=own)
+        for each, own in zip(sets, parts, strict=True)
+    )
+
+
 def stations(sets: Sequence[Observations]) -> tuple[Index, ...]:
     """Return at which of few stations each pair (N,) of each set is, counted over all sets.
 

@@ -66,9 +66,15 @@ class Samples:
 
     def select(self, index: NDArray[np.generic]) -> Samples:
         """Return the samples chosen by a mask (N,) or indices (K,), with their weights."""
-        few = type(self)(self.observations.select(index), *self.sigmas)
+        few = self.of(self.observations.select(index))
         few.weights = None if self.weights is None else self.weights[index]
         return few
+
+    def of(self, observations: Observations) -> Samples:
+        """Return samples of other observations, with these weights."""
+        found = type(self)(observations, *self.sigmas)
+        found.weights = self.weights
+        return found
 
     def weighted(self, weights: FloatArray | None) -> Samples:
         """Return the samples with robust weights (N,); None for ones."""

@@ -7,7 +7,7 @@ import pytest
 
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import SCATTER, STILL, configurations
-from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.observations import Observations, sided
 from calib_ros.kinematics import se3
 
 
@@ -80,6 +80,18 @@ def test_speeds_tell_from_which_side_joints_came(rng):
     assert (replace(seen, velocity=speeds, approach=known).approach == known).all()
     with pytest.raises(InputError, match=r'^velocity of the observations hold NaN'):
         replace(seen, velocity=np.nan * speeds)
+
+
+def test_sides_follow_from_the_order_of_all_stops_where_no_signs_are_stated():
+    joints = np.array([[0.0, 1.0], [0.1, 1.0], [0.1, 1.0], [0.3, 0.5], [0.2, 0.5]])
+    every = Observations.from_arrays(joints, np.zeros((5, 3)))
+    wanted = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, -1.0], [-1.0, -1.0]])
+    even, odd = every.select(np.array([4, 0, 2])), every.select(np.array([1, 3]))
+    first, second = sided([even, odd])
+    np.testing.assert_array_equal(first.approach, wanted[[4, 0, 2]])
+    np.testing.assert_array_equal(second.approach, wanted[[1, 3]])
+    stated = replace(odd, approach=-np.ones((2, 2)))
+    assert sided([even, stated])[1] is stated
 
 
 def test_a_plane_needs_heights():

@@ -57,13 +57,18 @@ def test_effects_that_cannot_be_told_are_refused(effects, said):
         Problem(UR10E, SEEN, effects=effects)
 
 
-def test_backlash_is_considered_of_joints_with_known_moves():
+def test_backlash_is_considered_of_joints_with_known_moves_or_from_both_sides():
     signs = np.zeros((4, 6))
     signs[1, 2], signs[3, 4] = 1.0, -1.0
+    rising = replace(SEEN, joints=np.arange(4.0)[:, np.newaxis] * np.ones(6))
     names = UR10E.parameter_names
-    without = considered(UR10E, names, sets=[SEEN])
-    found = considered(UR10E, names, sets=[SEEN, replace(SEEN, approach=signs)])
+    without = considered(UR10E, names, sets=[rising])
+    found = considered(UR10E, names, sets=[replace(rising, approach=signs)])
     assert set(found) - set(without) == {'elbow_joint.backlash', 'wrist_2_joint.backlash'}
+    back = rising.joints.copy()
+    back[3, 0] = 0.0
+    found = considered(UR10E, names, sets=[replace(rising, joints=back)])
+    assert set(found) - set(without) == {'shoulder_pan_joint.backlash'}
 
 
 def test_rows_know_their_samples():
