@@ -36,7 +36,8 @@ class Step:
     orientations ('rad'); of a zero its own, with its sign. `share` is its share of the squared
     residuals beyond that of as many useless parameters. If all measurements on one side are
     outliers, `unused` says which: the fit of frames is not affected. If the arm's places before
-    and after lie `apart`, its errors may look like a step of that size.
+    and after lie `apart`, its errors may look like a step of that size. So do those of the joint
+    `turned`, which seldom moved, but did so just before: by chance a step is hardly there.
     """
 
     owners: tuple[str, ...]
@@ -51,6 +52,7 @@ class Step:
     unused: str
     where: str
     apart: bool = False
+    turned: str = ''
     held: bool = False
     """Whether a frame that the chain file holds is wrong from the first pose on."""
     slow: bool = False
@@ -154,7 +156,9 @@ class Step:
             more += f'; if these are several {several}s, name each (column {several}, or sources)'
         if self.longer and not (self.slow or self.later):
             more += f'; {self._correction}'
-        if self.apart:
+        if self.turned:
+            more += f'; errors of {self.turned} may look so, as it moved just there: mix poses'
+        elif self.apart:
             more += (
                 '; errors of the arm may look so, as poses before and after lie apart: mix them'
             )

@@ -35,6 +35,7 @@ from calib_ros.decision.moved import (
 )
 from calib_ros.decision.scan import Scan, Switched
 from calib_ros.decision.trials import fault_limit
+from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import gain_of
 from calib_ros.estimation.gross_errors import SUSPICIOUS
@@ -368,11 +369,21 @@ def _step_of(scan: Scan, found: _Found, number: int) -> Step | None:
         unused=''.join(unused),
         where=place_of(problem, of_set, int(sample)),
         apart=abs(size) <= most and _separable(joints, later),
+        turned=_turned(scan, found.stops) if abs(size) <= most and not found.slow else '',
         held=bool(held),
         slow=found.slow,
         spoils=found.spoils,
         longer=longer,
     )
+
+
+def _turned(scan: Scan, places: Sequence[int]) -> str:
+    """Return the joint that seldom moves, but did before each of these stops; empty if none."""
+    joints, numbers = scan.joints(range(len(scan.sets))), np.concatenate(scan.numbers)
+    standing = joints[np.unique(numbers, return_index=True)[1]]
+    moves = np.abs(np.diff(standing, axis=0, prepend=standing[:1])) > STILL
+    found = moves[list(places)].all(axis=0) & (moves.mean(axis=0) < EXCEPTION)
+    return str(scan.chain.joint_names[int(np.argmax(found))]) if found.any() else ''
 
 
 def _separable(joints: FloatArray, after: Flags) -> bool:

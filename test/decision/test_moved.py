@@ -53,6 +53,12 @@ ZERO = replace(FRAME, owners=('wire',), kind='zero', thing='the device', longer=
             f'base moved by 1.2 mm before pose 7{AGAIN}',
         ),
         (
+            replace(FRAME, apart=True, turned='a'),
+            'the device moved by 1.2 mm (base) before row 5; errors of a may look so, as it moved '
+            'just there: mix poses',
+            f'base moved by 1.2 mm before pose 7{AGAIN}',
+        ),
+        (
             JOINT,
             'the zero of elbow_joint moved by 1.2 mrad before row 5',
             f'the zero of elbow_joint moved by 1.2 mrad before pose 7{AGAIN}',
