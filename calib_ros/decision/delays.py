@@ -18,6 +18,7 @@ from functools import partial
 import numpy as np
 from scipy import special
 
+from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.rounding import rounded_joints
 from calib_ros.decision.steps import EXPLAINED
@@ -167,46 +168,70 @@ def _widened(fitted: Fitted, jitter: float, each: Observations) -> Observations:
 def _rows(problem: Problem) -> tuple[Fitted, list[FloatArray]]:
     """Return a fit to some samples, and their rows (P, c, N): of its delay, then the residual.
 
-    Those of delays of single joints are before them. Gross errors count for less: a part of the
-    session may seem to be some.
+    Those of delays and play of single joints, and of their ratios, are before them. Gross errors
+    count for less: a part of the session may seem to be some.
     """
     fitted = fit(problem.with_sets(each.spread(SOME) for each in problem.sets))
-    lags, few = effects.members(fitted.chain, 'backlash'), fitted.problem.sets
-    lags = () if set(lags) & set(fitted.names) else lags
-    if lags:
-        few = tuple(replace(each, approach=each.velocity) for each in few)
+    lags, sets = effects.members(fitted.chain, 'backlash'), fitted.problem.sets
+    rivals = [*lags, *effects.members(fitted.chain, 'ratio')]
+    names, chain = [*dict.fromkeys([*fitted.names, *rivals])], fitted.chain.with_effects(rivals)
     weights = [weights_of(each, 'huber') for each in fitted.robust.distances]
-    system = problem.system(few).weighted(weights)
-    chain, names = fitted.chain.with_effects(lags), [*fitted.names, *lags]
+    speeds = [replace(each, approach=each.velocity) for each in sets]
+    own, late = (problem.system(each).weighted(weights).sets for each in (sets, speeds))
     return fitted, [
-        samples.rows_of(chain, [*names, Parameter(each.base, DELAY)])
-        for samples, each in zip(system.sets, few, strict=True)
+        np.concatenate(
+            [
+                by_speed.rows_of(chain, lags)[:-1],
+                samples.rows_of(chain, [*names, Parameter(each.base, DELAY)]),
+            ]
+        )
+        for by_speed, samples, each in zip(late, own, sets, strict=True)
     ]
 
 
-def uneven(problem: Problem, result: Identification) -> tuple[str, Problem] | None:
+def uneven(problem: Problem, result: Identification) -> tuple[str, Problem | None] | None:
     """Return what explains most of the residuals, and the problem without it; None if nothing.
 
-    Where true play explains more, it is that.
+    Joints late by different times, joints out of scale, or, without such a problem, play.
     """
-    lags = [Parameter(name) for name in effects.members(result.chain, 'backlash')]
-    if set(lags) & set(result.names):
+    chain, known = result.chain, set(result.names)
+    play, ratios = (effects.members(chain, group) for group in ('backlash', 'ratio'))
+    if known & {*play, *ratios}:
         return None
-    by_play, _, _ = _explained(problem, result, lags, np.sign)
-    share, sizes, strong = _explained(problem, result, lags, np.positive)
-    if share < EXPLAINED or share < by_play:
+    played, _, _ = _explained(problem, result, play, np.sign)
+    scaled, ratio, strong = _explained(problem, result, ratios, np.sign)
+    share, delays, late = _explained(problem, result, play, np.positive)
+    if (most := max(played, scaled, share)) < EXPLAINED:
         return None
-    text = (
-        f'joints late by different times explain {100.0 * share:.0f} % of the residuals, above '
-        f'all {lags[int(np.argmax(strong))].owner}: read all joints at one moment, or stop at '
-        'each pose (mode dwell)'
-    )
-    own = [list(problem.chain.joint_names).index(name.owner) for name in lags]
+    explain = f'{100.0 * most:.0f} % of the residuals'
+    if most == played:
+        return (
+            f'the joints have play, which explains {explain}: fit the play (model auto), or stop '
+            'at each pose (mode dwell), reached from the same side, in use as well'
+        ), None
+    if most == scaled:
+        k = int(np.argmax(strong))
+        if abs(ratio[k]) < EXCEPTION**2:  # as arms that bend seem to have
+            return None
+        delays, ratio = 0.0 * delays, ratio * (np.arange(len(ratio)) == k)
+        text: str = Reason(
+            Rule.MISTAKE,
+            f'{ratios[k].owner} moves {100.0 * abs(ratio[k]):.2g} % '
+            f'{"more" if ratio[k] > 0.0 else "less"} than its values, which explains {explain}: '
+            'correct its gear ratio or the count of its encoder',
+        )
+    else:
+        ratio = 0.0 * ratio
+        text = (
+            f'joints late by different times explain {explain}, above all '
+            f'{play[int(np.argmax(late))].owner}: read all joints at one moment, look for wrong '
+            'speeds, or stop at each pose (mode dwell)'
+        )
     sets = []
     for each in problem.sets:
-        joints = each.joints.copy()
+        joints = each.joints * (1.0 + ratio)
         if each.velocity is not None:
-            joints[:, own] += each.velocity[:, own] * sizes
+            joints += each.velocity * delays
         sets.append(replace(each, joints=joints))
     return text, problem.with_sets(sets)
 
@@ -254,10 +279,10 @@ def unsteady(problem: Problem, result: Identification) -> tuple[str, bool]:
 def _explained(
     problem: Problem,
     result: Identification,
-    lags: list[Parameter],
+    lags: Sequence[Parameter],
     rate: Callable[[FloatArray], FloatArray],
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Return the share of the residual squares by L delays, their sizes and effects (L,)."""
+    """Return the share of the residual squares by L effects, their sizes and effects (L,)."""
     few, count = [each.spread() for each in problem.sets], len(result.names)
     few = [replace(s, approach=None if s.velocity is None else rate(s.velocity)) for s in few]
     chain, names = result.chain.with_effects(lags), [*result.names, *lags]

@@ -219,22 +219,22 @@ def _order(problem: Problem) -> str:
 def _lag(problem: Problem, result: Identification) -> Identification:
     """Return the result with the lag that explains most of its residuals, refused if it harms."""
     known = {each.rule for each in result.refusals} & {Rule.MISTAKE, Rule.ENCODER, Rule.MOVED}
-    if result.noise.position <= 1.0 or known:
+    if result.noise.position <= 1.0 or Rule.MISTAKE in known:
         return result
-    if all(each.velocity is None for each in problem.sets):
-        found = _stop_lag(problem, result)
-    else:
-        found = uneven(problem, result)
+    still = all(each.velocity is None for each in problem.sets)
+    found = _stop_lag(problem, result) if still else uneven(problem, result)
+    if known and not (found and isinstance(found[0], Reason)):
+        return result
     text, harmful = unsteady(problem, result)
     if read := other_delay(problem, result):
         text, harmful = read, bool(result.refusals)
     elif found is not None:
         text, other = found
-        harmful = other is not None and _imitated(other, result)
+        harmful = harmful and not still if other is None else _imitated(other, result)
     if harmful:
-        reason = Reason.with_remedy(Rule.LAG, text)
+        reason = text if isinstance(text, Reason) else Reason.with_remedy(Rule.LAG, text)
         return replace(result, refusals=(*result.refusals, reason))
-    return replace(result, remarks=(*result.remarks, *[text] * bool(text)))
+    return replace(result, remarks=(*result.remarks, *[str(text)] * bool(text)))
 
 
 def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | None] | None:

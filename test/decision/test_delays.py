@@ -39,9 +39,25 @@ def test_a_late_joint_is_brought_back_to_where_it_was():
     np.testing.assert_allclose(late[:5], [0.0, -4e-3, 0.0, 0.0, 0.0], rtol=0, atol=4e-4)
     assert re.fullmatch(
         r'joints late by different times explain 9\d % of the residuals, above all '
-        r'shoulder_lift_joint: read all joints at one moment, or stop at each pose \(mode dwell\)',
+        r'shoulder_lift_joint: read all joints at one moment, look for wrong speeds, or stop at '
+        r'each pose \(mode dwell\)',
         text,
     )
+
+
+@pytest.mark.parametrize(('joint', 'scale'), [(1, 1.1), (4, 0.98)])
+def test_a_wrong_gear_ratio_is_no_delay(joint, scale):
+    """A delay of each joint, or one that changes, was told instead."""
+    factor = np.where(np.arange(6) == joint, scale, 1.0)
+    seen = moving(100)
+    seen = replace(seen, joints=factor * seen.joints, velocity=factor * seen.velocity)
+    result = identify(Problem(UR10E, seen, **SIGMAS))
+    assert result.refusals[0].rule is Rule.MISTAKE
+    told = re.match(r'(.*) moves (.*) % (more|less) than its values', result.refusals[0])
+    assert told[1] == UR10E.joint_names[joint]
+    size = float(told[2]) * (1.0 if told[3] == 'more' else -1.0)
+    assert size == pytest.approx(100.0 / scale - 100.0, rel=0.1)
+    assert not any('delay changes' in each for each in result.remarks)
 
 
 def test_a_delay_that_changes_is_undone_where_the_arm_moved():
@@ -170,8 +186,8 @@ def test_places_of_a_device_in_blocks_are_no_lag():
     assert result.refusals[0].rule is Rule.LARGEST_ERROR
 
 
-def test_play_is_told_as_no_delay_by_a_model_that_holds_it():
-    """It was undone as a delay that changes, and the delay undone again beside the play."""
+def test_play_is_told_as_no_delay():
+    """It was undone as a delay that changes, and the delay undone again beside fitted play."""
     rng = np.random.default_rng(1)
     play = {name: rng.normal(scale=1e-3) for name in members(SCARA, 'backlash')}
     true = arm(rng, 0.4, SCARA).with_effect_values(play)
@@ -182,7 +198,7 @@ def test_play_is_told_as_no_delay_by_a_model_that_holds_it():
     speed = size * (rate * np.cos(waves)).sum(axis=2)
     seen = replace(measure(true, joints, rng, *NOISE, approach=np.sign(speed)), velocity=speed)
     problem = Problem(SCARA, seen, **SIGMAS)
-    assert timed(problem)[1]
+    assert timed(problem)[1] == ()
     result = identify_model(problem, 'auto')
     assert any('backlash' in name for name in result.names)
     assert not any('delay changes' in each for each in result.remarks)
