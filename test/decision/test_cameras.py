@@ -56,7 +56,7 @@ def test_intrinsics_that_are_not_those_of_the_camera_are_refused(on_flange, erro
 def test_intrinsics_that_the_arm_imitates_are_refused_though_they_explain_little():
     """An arm follows so much of a wrong lens that less than half is left for other intrinsics."""
     seen = images(False, 5, 0.2)
-    off = LENS.moved(dict.fromkeys(('fx', 'fy', 'cx', 'cy'), 3.0))
+    off = LENS.moved(dict.fromkeys(('fx', 'fy', 'cx', 'cy'), 2.0))
     for lens, refused in ((LENS, False), (off, True)):
         result = identify(Problem(nominal(False, lens), seen, sigma_pixel=0.1))
         assert result.accepted == (not refused)
