@@ -21,7 +21,8 @@ from calib_ros.apply.verified import Verification
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import CONFIDENT
-from calib_ros.estimation.observations import SOME_POSES, Observations, frames_of_sets
+from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.visits import frames_of_sets
 from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.jacobian import ErrorModel

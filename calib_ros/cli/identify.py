@@ -17,7 +17,7 @@ from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.errors import InputError
-from calib_ros.estimation.observations import frames_of_sets
+from calib_ros.estimation.visits import frames_of_sets
 from calib_ros.files import boards, detections, image_places
 from calib_ros.files.lenses import read_lens
 from calib_ros.files.loading import Loaded, load_bag, load_table

@@ -22,7 +22,8 @@ from calib_ros.decision.residuals import (
 )
 from calib_ros.estimation.configurations import renumber
 from calib_ros.estimation.levels import CONFIDENT
-from calib_ros.estimation.observations import Observations, numbered
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.visits import numbered
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index, norms
 from calib_ros.shown import Shown, as_frame, of_them

@@ -16,9 +16,10 @@ from calib_ros.estimation.evidence import Inference
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.leastsquares import leave_fold_out
 from calib_ros.estimation.levels import TELLING
-from calib_ros.estimation.observations import Observations, stations
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.system import System
+from calib_ros.estimation.visits import stations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import Index
 

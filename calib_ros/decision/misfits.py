@@ -21,10 +21,11 @@ from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import gain_share
 from calib_ros.estimation.gross_errors import SUSPICIOUS
 from calib_ros.estimation.levels import LEAST_ASIDE, NEARER, SURE, TELLING
-from calib_ros.estimation.observations import Observations, numbered
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import flange
 from calib_ros.estimation.system import stacked
+from calib_ros.estimation.visits import numbered
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel

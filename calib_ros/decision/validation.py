@@ -16,9 +16,10 @@ from calib_ros.decision.places import leave_one_place_out, places_of
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.levels import ALIKE, SURE
-from calib_ros.estimation.observations import Observations, stations
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.posterior import Posterior
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.visits import stations
 from calib_ros.estimation.weights import OUTLIER, distances_of
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel

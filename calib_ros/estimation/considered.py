@@ -11,8 +11,9 @@ from itertools import compress
 import numpy as np
 
 from calib_ros.estimation.levels import LARGEST_SCALE, OUT_OF_SCALE, PRINTED, SCALE
-from calib_ros.estimation.observations import Observations, sided
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.system import System
+from calib_ros.estimation.visits import sided
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_PIXELS, Parameter, parameters_of

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from calib_ros.annotated import as_annotated, check_fields
 from calib_ros.errors import InputError
-from calib_ros.estimation.configurations import SCATTER, STILL, configurations, renumber, stops
-from calib_ros.estimation.levels import NEARER, TELLING
+from calib_ros.estimation.configurations import configurations, renumber, stops
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.shown import Shown
@@ -349,57 +348,3 @@ def _refuse_other_than_rotations(turns: FloatArray) -> None:
             f'the rotation of pair {k} (counted from 0) is {what}: {np.count_nonzero(wrong)} of '
             f'{len(turns)} are not rotation matrices'
         )
-
-
-def frames_of_sets(sets: Sequence[Observations], base: bool, tool: bool) -> tuple[str, ...]:
-    """Return the frames of all devices of sets, if wanted, and of all targets."""
-    ends = ('base',) * base + ('tool',) * tool
-    return tuple(dict.fromkeys(getattr(each, end) for end in ends for each in sets))
-
-
-def numbered(sets: Sequence[Observations]) -> tuple[Index, ...]:
-    """Return the configuration numbers (N,) of each set, counted over all sets."""
-    if len(sets) == 1:
-        return (sets[0].configurations,)
-    numbers = configurations(np.concatenate([each.joints for each in sets]))
-    return tuple(np.split(numbers, np.cumsum([len(each) for each in sets])[:-1]))
-
-
-def sided(sets: Sequence[Observations]) -> tuple[Observations, ...]:
-    """Return sets with signs of the last moves, as if straight from stop to stop if unknown.
-
-    Joints come to their largest values from below: play so depends on them even in random order.
-    """
-    joints = np.concatenate([each.joints for each in sets])
-    order = np.argsort(np.concatenate([s.stamps_ns for s in sets]), kind='stable')
-    moves = np.diff(joints[order], axis=0, prepend=joints[order[:1]])
-    last = np.where(np.abs(moves) > STILL, np.arange(len(moves))[:, np.newaxis], 0)
-    signs = np.empty_like(joints)
-    signs[order] = np.sign(np.take_along_axis(moves, np.maximum.accumulate(last), axis=0))
-    parts = np.split(signs, np.cumsum([len(each) for each in sets])[:-1])
-    return tuple(
-        each if each.approach is not None and each.approach.any() else replace(each, approach=own)
-        for each, own in zip(sets, parts, strict=True)
-    )
-
-
-def stations(sets: Sequence[Observations]) -> tuple[Index, ...]:
-    """Return at which of few stations each pair (N,) of each set is, counted over all sets.
-
-    Half of the joints or more, which seldom move from stop to stop, stand still at a station.
-    Without stations, or at many, these are the configurations.
-    """
-    joints = np.concatenate([each.joints for each in sets])
-    ordered = joints[np.argsort(np.concatenate([s.stamps_ns for s in sets]), kind='stable')]
-    begins = np.flatnonzero(np.diff(stops(ordered), prepend=-1))
-    moves = np.abs(np.diff(ordered[begins], axis=0)) > STILL
-    times, moving = moves.sum(axis=0), np.count_nonzero(moves.any(axis=0))
-    seldom = joints[:, (times > 0) & (times < NEARER * len(moves))]
-    numbers = np.full(len(joints), TELLING)  # not yet at any
-    for k in range(TELLING if moving <= 2 * seldom.shape[1] < 2 * moving else 0):
-        first = seldom[(numbers == TELLING).argmax()]
-        near = np.abs(seldom - first).max(axis=1) <= SCATTER
-        numbers[near] = np.minimum(numbers[near], k)
-    if TELLING in numbers or not numbers.any():
-        return numbered(sets)
-    return tuple(np.split(numbers, np.cumsum([len(each) for each in sets])[:-1]))

@@ -15,9 +15,10 @@ import numpy as np
 from calib_ros.annotated import Fraction, Limit, Positive, Several, check_fields
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation.configurations import SCATTER
-from calib_ros.estimation.observations import Observations, numbered
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.pixels import samples_of
 from calib_ros.estimation.system import Prior, System
+from calib_ros.estimation.visits import numbered
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens

@@ -35,10 +35,10 @@ from calib_ros.estimation.drifting import DRIFT_KERNELS, device_drift, together
 from calib_ros.estimation.fading import DECAYS, faded_in_succession, faded_near
 from calib_ros.estimation.leastsquares import Fit
 from calib_ros.estimation.levels import CERTAIN, TELLING
-from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.quadratic_forms import QuadraticForms
 from calib_ros.estimation.stops import MOST_STOPS, Stops, gather, gathered
 from calib_ros.estimation.system import System
+from calib_ros.estimation.visits import numbered
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray

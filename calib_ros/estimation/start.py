@@ -30,12 +30,13 @@ from calib_ros.estimation.identifiability import (
 from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.levels import TELLING
 from calib_ros.estimation.normal import factor_of, triangular_factor
-from calib_ros.estimation.observations import Observations, numbered
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
 from calib_ros.estimation.robust import robust_fit
 from calib_ros.estimation.samples import Samples, residual_arrays
 from calib_ros.estimation.system import System
+from calib_ros.estimation.visits import numbered
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import require_lens

@@ -21,11 +21,12 @@ from calib_ros.decision.drift import ShiftProducts, Shifts, chance
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.identifiability import independent
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SURE
-from calib_ros.estimation.observations import SOME_POSES, numbered
+from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.posterior import size_group
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.samples import gram
 from calib_ros.estimation.system import row_samples, stacked
+from calib_ros.estimation.visits import numbered
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray

@@ -36,10 +36,11 @@ from calib_ros.estimation.gain import about_nominal
 from calib_ros.estimation.levels import SCALE, SEVERAL, TRIED, chance_of
 from calib_ros.estimation.normal import products_of
 from calib_ros.estimation.nuisances import Nuisances, nuisance_products
-from calib_ros.estimation.observations import SOME_POSES, Observations, frames_of_sets, numbered
+from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import in_new_frames, reframed
 from calib_ros.estimation.system import System
+from calib_ros.estimation.visits import frames_of_sets, numbered
 from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.age import drift_of, recorded_time
 from calib_ros.identification.calibration import Calibration, about, provenance

@@ -20,9 +20,9 @@ from calib_ros.decision.rounding import (
 )
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.observations import numbered, stations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.system import row_samples, stacked
+from calib_ros.estimation.visits import numbered, stations
 from calib_ros.identification import identification
 from calib_ros.identification.identification import identify
 from calib_ros.identification.model_choice import identify_model

@@ -7,7 +7,8 @@ import pytest
 
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import SCATTER, STILL, configurations
-from calib_ros.estimation.observations import Observations, sided
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.visits import sided
 from calib_ros.kinematics import se3
 
 

@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Where several sets of observations were: their frames, configurations, stations and sides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.estimation.configurations import SCATTER, STILL, configurations, stops
+from calib_ros.estimation.levels import NEARER, TELLING
+from calib_ros.estimation.observations import Observations
+from calib_ros.kinematics.se3 import FloatArray, Index
+
+S = TypeVar('S', bound=np.generic)
+
+
+def frames_of_sets(sets: Sequence[Observations], base: bool, tool: bool) -> tuple[str, ...]:
+    """Return the frames of all devices of sets, if wanted, and of all targets."""
+    ends = ('base',) * base + ('tool',) * tool
+    return tuple(dict.fromkeys(getattr(each, end) for end in ends for each in sets))
+
+
+def numbered(sets: Sequence[Observations]) -> tuple[Index, ...]:
+    """Return the configuration numbers (N,) of each set, counted over all sets."""
+    if len(sets) == 1:
+        return (sets[0].configurations,)
+    numbers = configurations(np.concatenate([each.joints for each in sets]))
+    return _split(numbers, sets)
+
+
+def sided(sets: Sequence[Observations]) -> tuple[Observations, ...]:
+    """Return sets with signs of the last moves, as if straight from stop to stop if unknown.
+
+    Joints come to their largest values from below: play so depends on them even in random order.
+    """
+    joints, order = _in_order(sets)
+    moves = np.diff(joints[order], axis=0, prepend=joints[order[:1]])
+    last = np.where(np.abs(moves) > STILL, np.arange(len(moves))[:, np.newaxis], 0)
+    signs = np.empty_like(joints)
+    signs[order] = np.sign(np.take_along_axis(moves, np.maximum.accumulate(last), axis=0))
+    return tuple(
+        each if each.approach is not None and each.approach.any() else replace(each, approach=own)
+        for each, own in zip(sets, _split(signs, sets), strict=True)
+    )
+
+
+def stations(sets: Sequence[Observations]) -> tuple[Index, ...]:
+    """Return at which of few stations each pair (N,) of each set is, counted over all sets.
+
+    Half of the joints or more, which seldom move from stop to stop, stand still at a station.
+    Without stations, or at many, these are the configurations.
+    """
+    joints, order = _in_order(sets)
+    begins = np.flatnonzero(np.diff(stops(joints[order]), prepend=-1))
+    moves = np.abs(np.diff(joints[order[begins]], axis=0)) > STILL
+    times, moving = moves.sum(axis=0), np.count_nonzero(moves.any(axis=0))
+    seldom = joints[:, (times > 0) & (times < NEARER * len(moves))]
+    numbers = np.full(len(joints), TELLING)  # not yet at any
+    for k in range(TELLING if moving <= 2 * seldom.shape[1] < 2 * moving else 0):
+        first = seldom[(numbers == TELLING).argmax()]
+        near = np.abs(seldom - first).max(axis=1) <= SCATTER
+        numbers[near] = np.minimum(numbers[near], k)
+    if TELLING in numbers or not numbers.any():
+        return numbered(sets)
+    return _split(numbers, sets)
+
+
+def _in_order(sets: Sequence[Observations]) -> tuple[FloatArray, Index]:  # of stamps
+    stamps = np.concatenate([each.stamps_ns for each in sets])
+    return np.concatenate([each.joints for each in sets]), np.argsort(stamps, kind='stable')
+
+
+def _split(values: NDArray[S], sets: Sequence[Observations]) -> tuple[NDArray[S], ...]:
+    return tuple(np.split(values, np.cumsum([len(each) for each in sets])[:-1]))
