@@ -49,7 +49,7 @@ from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray, norms
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, norms
 from calib_ros.settings import GROWTH
 from calib_ros.shown import rows_in_words
 
@@ -214,9 +214,8 @@ def _rms_positions(arm: _Arm, before: FloatArray, found: _Found) -> tuple[float,
 def _may_be_scaled(chain: Chain, sets: Sequence[Observations]) -> bool:
     """Tell whether one device measured all, with a scale that positions would show."""
     base, *others = {each.base for each in sets}
-    if others or chain.frame(base).fixed:
-        return False
-    return all(
+    alone = not (others or chain.frame(base).fixed)
+    return alone and all(
         each.distances is None and each.points is None and not (each.socket or each.inverse)
         for each in sets
     )
@@ -303,8 +302,7 @@ class _Arm:
     @property
     def own(self) -> list[int]:
         """Return the indices of the calibration's parameters, fitted or held nominal."""
-        known = self.previous.names
-        return [k for k, name in enumerate(self.names) if name in known or name.of_dh]
+        return [k for k, n in enumerate(self.names) if n.of_dh or n in self.previous.names]
 
     def applied(self, change: FloatArray, covariance: FloatArray) -> FloatArray:
         """Return the change (P,) by poses if the considered effects are zero, as in the chain.
@@ -328,7 +326,7 @@ class _Arm:
         """
         change = np.zeros(len(self.names))
         nuisances = Nuisances(by_device=True, unmodelled=self.previous.unmodelled)
-        for _ in range(4):  # changes of millimetres converge in two
+        for _ in range(4 * SEVERAL):  # changes of millimetres converge in two
             chain = self.chain.with_offsets(dict(zip(self.names, change, strict=True)))
             found = nuisance_products(chain, self.names, system, nuisances, most=system.count)
             if not all(np.isfinite(part).all() for part in found):
@@ -336,7 +334,9 @@ class _Arm:
             products = found.reduced
             information = Information(self.names, *about_nominal(products[:-1], change))
             squares = float(products[-1, -1] + change @ (products[:-1, -1] + information.vector))
-            change, covariance = information.mean(self.root)
+            last, (change, covariance) = change, information.mean(self.root)
+            if np.abs(change - last).max() < HALF_THE_DIGITS:
+                break
         return _Found(change, covariance, information, squares)
 
 

@@ -12,6 +12,7 @@ from fits import NOISE, SIGMAS, UR10E
 from calib_ros import Calibration, Problem, identify, recalibrate
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError
+from calib_ros.kinematics import se3
 
 TRUE = faulty(UR10E, Cell(), np.random.default_rng(4))
 
@@ -63,3 +64,19 @@ def test_device_and_target_that_both_moved_far_are_named(earlier):
     other = replace(faulty(UR10E, Cell(), np.random.default_rng(5)), **frames)
     with suppress(InputError):
         assert not recalibrate(earlier[0], seen(12, true=other, **SIGMAS), 0.1).accepted
+
+
+def test_moved_frames_and_a_slipped_zero_are_placed_as_well_as_the_arm_is_known(earlier):
+    """The frames were accepted before they converged, 7 mm off."""
+    now, rng = TRUE.with_offsets({'elbow_joint.theta': 2e-3}), np.random.default_rng(3)
+    for end, size in (('base', 0.3), ('tool', 0.05)):
+        frame, matrix = now.frame(end), np.eye(4)
+        matrix[:3, :3] = se3.exp_rotation(0.3 * rng.normal(size=3))
+        matrix[:3, 3] = size * rng.normal(size=3)
+        now = now.with_frame(end, replace(frame, matrix=frame.matrix @ matrix))
+    found = recalibrate(earlier[0], seen(16, true=now, **SIGMAS), 0.1)
+    assert found.accepted
+    assert [reasons[0].owner for reasons in found.changed] == ['base', 'tool', 'elbow_joint']
+    joints = now.random_joints(200, rng)
+    left = found.calibration.chain.forward(joints) - now.forward(joints)
+    assert np.sqrt((left[:, :3, 3] ** 2).sum(axis=1).mean()) < 1.5e-4
