@@ -327,9 +327,9 @@ class Observations(Shown):
 
     @cached_property
     def by_joint(self) -> tuple[FloatArray, FloatArray]:
-        """Return joint values and the tangents of their halves (n, N), for the solver."""
+        """Return joint values (n, N), and their cosines and sines (2, n, N), for the solver."""
         rows = np.ascontiguousarray(self.joints.T)
-        return rows, np.tan(0.5 * rows)
+        return rows, np.array(se3.cos_sin(rows))
 
     @cached_property
     def stops(self) -> Index:

@@ -45,7 +45,7 @@ class Samples:
     ) -> None:
         self.observations = self.moments = observations
         self.count = len(observations)
-        self.joints, self._tangents = observations.by_joint
+        self.joints, self._circle = observations.by_joint
         self.positions = np.ascontiguousarray(observations.positions.T)
         self.points = np.ascontiguousarray(observations.given.T) if observations.seen else None
         approach = observations.approach
@@ -156,10 +156,10 @@ class Samples:
                 out = None  # the last is shorter
             approach = None if self.approach is None else self.approach[:, part]
             moving = None if velocity is None else velocity[:, part]
-            tangents = self._tangents[:, part] if joints is self.joints else None
+            circle = self._circle[:, :, part] if joints is self.joints else None
             points = None if self.points is None else self.points[:, part]
             axes, origin, *found, phi = model.linearise(
-                joints[:, part], approach, moving, out, points, tangents
+                joints[:, part], approach, moving, out, points, circle
             )
             out = found[0], found[1]
             shift = found[0]

@@ -81,13 +81,13 @@ class ErrorModel:
         velocity: FloatArray | None = None,
         out: tuple[FloatArray, FloatArray] | None = None,
         points: FloatArray | None = None,
-        tangents: FloatArray | None = None,
+        circle: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return axes (3, 3, B), origin (3, B) [m] and derivatives of the target for one block.
 
         `q` (n, B) [rad or m] are joint values, `approach` (n, B) signs of the preceding
         velocities, for backlash, `velocity` (n, B) those for the delay of the device, `points` (3,
-        B) [m] the target in the frame of the tool, `tangents` as in `Walk.frames`. The
+        B) [m] the target in the frame of the tool, `circle` as in `Walk.frames`. The
         first index of the axes counts them. The derivatives are `shift` (K + 1, 3, B) of the
         position, rotations first, and `turn` (K_rotational + 1, 3, B) of the orientation as a
         rotation vector in the world; their last row is free for the residual. They are written to
@@ -98,7 +98,7 @@ class ErrorModel:
         names = tuple(dict.fromkeys((*layout.effects, *(n for n, v in self.chain.effects if v))))
         phi = effects.basis(self.chain, names, q, approach)
         moved = effects.moved_joints(self.chain, names, phi, q)
-        frames, target = self._frames(moved, tangents if moved is q else None)
+        frames, target = self._frames(moved, circle if moved is q else None)
         if points is not None:
             target[3] += np.einsum('kcb,kb->cb', target[:3], points)
         flat = frames.reshape(4 * len(frames), 3, samples)
@@ -116,7 +116,7 @@ class ErrorModel:
         phi = phi[: len(layout.effects)] * walk.signs[layout.joints]
         return target[:3], target[3], shift, turn, phi
 
-    def _frames(self, q: FloatArray, tangents: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    def _frames(self, q: FloatArray, circle: FloatArray | None) -> tuple[FloatArray, FloatArray]:
         """Return frames (F, 4, 3, B) along the chain and the target's (4, 3, B).
 
         Those before the joints, of the flange, of the world at the base, the flange's axes at the
@@ -125,7 +125,7 @@ class ErrorModel:
         count, samples = q.shape
         walk, behind = self.chain.walk, self._layout.behind
         frames = np.empty((count + 3 + self._layout.beside * count, 4, 3, samples))
-        walk.frames(q, self._base, frames[: count + 1], tangents=tangents)
+        walk.frames(q, self._base, frames[: count + 1], circle=circle)
         target = self.chain.at_the_tool(frames[count], self.ends[1])
         frames[count + 1] = self._origin
         frames[count + 2, :3], frames[count + 2, 3] = frames[count, :3], target[3]

@@ -79,12 +79,8 @@ def turned(x: float, y: float, z: float) -> FloatArray:
 
 
 def cos_sin(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return cosines and sines of angles (...) [rad]."""
-    return on_circle(np.tan(0.5 * angles))
-
-
-def on_circle(tangent: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return cosines and sines of angles (...), from the tangents of half angles."""
+    """Return cosines and sines of angles (...) [rad], from the tangents of half angles."""
+    tangent = np.tan(0.5 * angles)
     square = tangent * tangent
     scale = 1.0 / (1.0 + square)
     return (1.0 - square) * scale, (tangent + tangent) * scale

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib_ros.kinematics.se3 import Flags, FloatArray, cos_sin, on_circle
+from calib_ros.kinematics.se3 import Flags, FloatArray, cos_sin
 
 BLOCK = 2000
 """Samples per operation: their arrays fit the caches (benchmarks/peers.py), where rows a power of
@@ -68,20 +68,19 @@ class Walk:
         base: FloatArray,
         found: FloatArray,
         ends: FloatArray | None = None,
-        tangents: FloatArray | None = None,
+        circle: FloatArray | None = None,
     ) -> FloatArray:
         """Write the frames of joints (before their motion) and flange to `found` (n + 1, 4, 3, B).
 
         At effective joint values (n, B), from T_world_base (4, 4). `ends` (n, 4, 3, B) receives
         the frames at the ends of the links of the modified convention; in the standard one these
-        are the following frames. `tangents` (n, B) are those of half of q, if known.
+        are the following frames. `circle` (2, n, B) are the cosines and sines of q, if known.
         """
         values = self.signs * q
-        if tangents is None or not self.turning.all():
+        if circle is None or not self.turning.all():
             cos, sin = cos_sin(self._theta + values * self._turns)
         else:
-            (first, second), (along, across) = self._turn, on_circle(tangents)
-            across *= self.signs
+            (first, second), along, across = self._turn, circle[0], self.signs * circle[1]
             cos, sin = first * along - second * across, second * along + first * across
         frame, turned = np.empty((4, *found.shape[2:])), np.empty((2, *found.shape[2:]))
         frame[:] = base[:3].T[..., np.newaxis]
