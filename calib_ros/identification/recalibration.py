@@ -46,10 +46,9 @@ from calib_ros.identification.age import drift_of, recorded_time
 from calib_ros.identification.calibration import Calibration, about, provenance
 from calib_ros.identification.fingerprint import Fingerprint
 from calib_ros.identification.recalibrated import Recalibration
-from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, norms
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, invert, norms
 from calib_ros.settings import GROWTH
 from calib_ros.shown import rows_in_words
 
@@ -367,9 +366,9 @@ def _updated(
     before = previous.before
     for name in before.frame_names:
         old, new, current = (each.frame(name) for each in (previous.chain, chain, before))
-        moved = new.matrix @ se3.invert(old.matrix) @ current.matrix
+        moved = new.matrix @ invert(old.matrix) @ current.matrix
         if name.startswith('tool'):
-            moved = current.matrix @ se3.invert(old.matrix) @ new.matrix
+            moved = current.matrix @ invert(old.matrix) @ new.matrix
         before = before.with_frame(name, replace(current, matrix=moved))
     own, region = arm.own, previous.region
     left = found.change - arm.applied(found.change, found.covariance)
