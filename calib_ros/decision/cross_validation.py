@@ -42,11 +42,10 @@ def cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Comparison
     folds = _fold_count(problem, names, count, rows)
     if folds < 2:
         return None, 'nothing: too few poses to hold any out'
-    frames = [name for name in names if before.owns_frame(name)]
     numbers = [group % folds for group in groups]
     order = [np.argsort(each, kind='stable') for each in numbers]
     by_fold = system.select(order), [*map(np.sort, numbers)]  # sorted once
-    fits = (before, frames), (fitted.chain, names)
+    fits = (before, fitted.frames), (fitted.chain, names)
     chains = zip(*(leave_fold_out(one, some, *by_fold) for one, some in fits), strict=True)
     pair = fold_residuals(chains, problem.sets, groups, numbers)
     judged = Comparison(*pair, ~fitted.robust.outliers, kind=kind)

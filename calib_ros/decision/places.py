@@ -49,7 +49,6 @@ def leave_one_place_out(
         apart = tuple(pair for pair in fitted.system.separations if {*pair[:2]} <= known)
         return replace(fitted.system, sets=tuple(chosen), separations=apart)
 
-    frames = [name for name in names if before.owns_frame(name)]
     anywhere, rows = drawn(problem.model, names, problem.sets)
     chains: list[list[Chain]] = [[], []]
     for place in places:
@@ -62,7 +61,7 @@ def leave_one_place_out(
         # without this place a gauge may be free; frames come first, so they are the same alone
         known = independent_in([*there, others.separation_rows(anywhere, rest)[0]], rest)
         kept = {*known, *problem.prior_sigmas}
-        fits = (before, frames), (fitted.chain, names)
+        fits = (before, fitted.frames), (fitted.chain, names)
         for found, (chain, wanted) in zip(chains, fits, strict=True):
             rest = [name for name in wanted if name in kept and name not in own]
             found.append(minimise(minimise(chain, rest, others).chain, own, left).chain)

@@ -140,7 +140,8 @@ class _Columns:
         beside = {name: std for name, std in given.rounding.items() if name in names}
         whole, lengths, self.scale = self.chain, dict[str, float](), SCALE
         if seen:
-            system = system.sided()
+            if any(n.kind in effects.PLAY for n in map(Parameter, own)):
+                system = fitted.sided
             whole, lengths, self.scale = lengths_of(self.chain, system)
         strained &= bool(lengths)
         noise = max(given.noise, HALF_THE_DIGITS)  # parameters that follow all exactly leave none

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,8 +19,9 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import Robust
 from calib_ros.estimation.system import System
 from calib_ros.estimation.uncertainty import Uncertainty
+from calib_ros.estimation.visits import sided
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.parameter import DELAY, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
 
 
@@ -92,10 +93,23 @@ class Fitted:
         """Return the samples with their weights in the fit."""
         return self.robust.system
 
+    @cached_property
+    def sided(self) -> System:
+        """Return these samples with signs of the last moves (`visits.sided`)."""
+        seen = sided([samples.observations for samples in self.system.sets])
+        pairs = zip(self.system.sets, seen, strict=True)
+        return replace(self.system, sets=tuple(samples.of(each) for samples, each in pairs))
+
     def good_sets(self, most: int = SOME_POSES) -> list[Observations]:
         """Return evenly spread samples of each set, at most `most`, without gross errors."""
         pairs = zip(self.problem.sets, self.robust.inliers, strict=True)
         return [each.select(good).spread(most) for each, good in pairs]
+
+    @property
+    def frames(self) -> list[str]:
+        """Return what is fitted of frames beside the nominal arm: its errors delay no device."""
+        own = filter(self.start.owns_frame, self.names)
+        return [name for name in own if Parameter(name).kind != DELAY]
 
     @cached_property
     def offsets(self) -> FloatArray:

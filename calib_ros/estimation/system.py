@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.estimation.samples import Samples
-from calib_ros.estimation.visits import sided
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray, Index
@@ -80,12 +79,6 @@ class System(Shown):
         """Return chosen samples and their weights, by masks (N,) or indices (K,) for each set."""
         pairs = zip(self.sets, chosen, strict=True)
         return replace(self, sets=tuple(samples.select(index) for samples, index in pairs))
-
-    def sided(self) -> System:
-        """Return it with signs of the last moves, as if straight from stop to stop if unknown."""
-        seen = sided([samples.observations for samples in self.sets])
-        sets = (samples.of(each) for samples, each in zip(self.sets, seen, strict=True))
-        return replace(self, sets=tuple(sets))
 
     def spread(self, most: int) -> System:
         """Return every k-th sample of each set: at most `most` in all, or one of each set."""

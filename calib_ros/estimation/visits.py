@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -44,7 +43,7 @@ def sided(sets: Sequence[Observations]) -> tuple[Observations, ...]:
     signs = np.empty_like(joints)
     signs[order] = np.sign(np.take_along_axis(moves, np.maximum.accumulate(last), axis=0))
     return tuple(
-        each if each.approach is not None and each.approach.any() else replace(each, approach=own)
+        each if each.approach is not None and each.approach.any() else each.changed(approach=own)
         for each, own in zip(sets, _split(signs, sets), strict=True)
     )
 

@@ -53,7 +53,6 @@ from calib_ros.estimation.system import System
 from calib_ros.estimation.uncertainty import Uncertainty
 from calib_ros.estimation.unmodelled import unmodelled_errors
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.parameter import DELAY, Parameter
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import EXCEPTION
 
@@ -150,11 +149,9 @@ def _identified(
 
 def _in_best_frames(fitted: Fitted) -> Fit:
     """Return the fit of the frames of the nominal arm; no error of it delays the device."""
-    start, system = fitted.start, fitted.robust.system
-    frames = [name for name in fitted.names if start.owns_frame(name)]
-    delays = [name for name in frames if Parameter(name).kind == DELAY]
+    start, system, frames = fitted.start, fitted.robust.system, fitted.frames
+    delays = {*filter(start.owns_frame, fitted.names)} - {*frames}
     start = start.with_offsets({n: fitted.chain.value(n) - start.value(n) for n in delays})
-    frames = [name for name in frames if name not in delays]
     if system.count > 4 * SOME:
         most = max(SOME, int(EXCEPTION * system.count))
         start = minimise(start, frames, system.spread(most)).chain
