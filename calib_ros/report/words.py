@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from calib_ros.apply.confidence import interval_of, rms_limits
+from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.judgement import Judgement
 from calib_ros.decision.changes import changes_in_words
 from calib_ros.decision.comparison import Comparison
@@ -93,8 +93,7 @@ def rms_range_mm(judged: Comparison | None, when: int) -> str:
 
 def interval_mm(lower: float, upper: float) -> str:
     """Return an interval [mm] with as many decimals at both ends, if the upper one has any."""
-    (least,), (most,) = rms_limits(1.0, np.ones(1), CONFIDENT)  # of one degree of freedom
-    if upper > lower * most / least:
+    if np.isinf(upper):
         return f'at least {rounded(lower)}'
     end = rounded(upper)
     decimals = len(end.partition('.')[2])
