@@ -216,7 +216,7 @@ def uneven(problem: Problem, result: Identification) -> tuple[str, Problem | Non
         delays, ratio = 0.0 * delays, ratio * (np.arange(len(ratio)) == k)
         text: str = Reason(
             Rule.MISTAKE,
-            f'{ratios[k].owner} moves {100.0 * abs(ratio[k]):.2g} % '
+            f'{ratios[k].owner} moves {two_digits(100.0 * abs(ratio[k]))} % '
             f'{"more" if ratio[k] > 0.0 else "less"} than its values, which explains {explain}: '
             'correct its gear ratio or the count of its encoder',
         )

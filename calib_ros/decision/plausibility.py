@@ -219,18 +219,21 @@ def _order(problem: Problem) -> str:
 def _lag(problem: Problem, result: Identification) -> Identification:
     """Return the result with the lag that explains most of its residuals, refused if it harms."""
     known = {each.rule for each in result.refusals} & {Rule.MISTAKE, Rule.ENCODER, Rule.MOVED}
-    if result.noise.position <= 1.0 or Rule.MISTAKE in known:
-        return result
     still = all(each.velocity is None for each in problem.sets)
+    if result.noise.position <= 1.0 or Rule.MISTAKE in known or (known and still):
+        return result
     found = _stop_lag(problem, result) if still else uneven(problem, result)
     if known and not (found and isinstance(found[0], Reason)):
-        return result
+        return result  # only a wrong ratio looks like them
     text, harmful = unsteady(problem, result)
     if read := other_delay(problem, result):
         text, harmful = read, bool(result.refusals)
     elif found is not None:
         text, other = found
-        harmful = harmful and not still if other is None else _imitated(other, result)
+        if other is not None:
+            harmful = _imitated(other, result)
+        elif still:  # play at stops is told, not refused
+            harmful = False
     if harmful:
         reason = text if isinstance(text, Reason) else Reason.with_remedy(Rule.LAG, text)
         return replace(result, refusals=(*result.refusals, reason))
