@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from datetime import date, datetime, timedelta, timezone
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
 from calib_ros.files.hashes import settings_hash
@@ -30,6 +30,9 @@ KEYS = {
     'settings': tuple(each.name for each in fields(Settings)),
 }
 
+Arm: TypeAlias = Chain | ConfigError
+"""A nominal chain, or why it cannot be read, which costs only the nights of its robots."""
+
 
 @dataclass(frozen=True)
 class Pattern:
@@ -44,12 +47,19 @@ class Robot:
     """A robot of the plant."""
 
     serial: str
-    chain: Chain
+    arm: Arm
     measured: tuple[Pattern, ...]
     settings: Settings = field(default_factory=Settings)
     tolerance: float | None = None  # wanted RMS position error [mm]
     largest_loss: float = EXCEPTION  # share of a bag's messages that may be lost
     since: datetime | None = None  # earlier measurements are not compared
+
+    @property
+    def chain(self) -> Chain:
+        """Return the nominal chain; raise ConfigError if it cannot be read."""
+        if isinstance(self.arm, ConfigError):
+            raise self.arm
+        return self.arm
 
     def compares(self, time: datetime) -> bool:
         """Tell whether measurements at a time are compared with later ones."""
@@ -79,7 +89,7 @@ def parse_plant(text: str, folder: Path, where: str = 'plant file') -> tuple[Rob
     rows = content.get('robots')
     if not isinstance(rows, list) or not rows:
         raise ConfigError(f'{where}: robots must be a list, each with serial, chain and measured')
-    chains: dict[str, Chain] = {}
+    chains: dict[str, Arm] = {}
     robots: dict[str, Robot] = {}
     for number, row in enumerate(rows, 1):
         robot = _robot(row, groups, folder, f'{where}: robot {number}', chains)
@@ -90,7 +100,7 @@ def parse_plant(text: str, folder: Path, where: str = 'plant file') -> tuple[Rob
 
 
 def _robot(
-    row: object, groups: Mapping[str, Any], folder: Path, where: str, chains: dict[str, Chain]
+    row: object, groups: Mapping[str, Any], folder: Path, where: str, chains: dict[str, Arm]
 ) -> Robot:
     own = parse_mapping(row, KEYS['a robot'], where)
     serial = parse_serial(own.get('serial'), f'{where}: serial')
@@ -117,13 +127,13 @@ def _robot(
     loss = parse_number(given.get('largest_loss', Robot.largest_loss), f'{where}: largest_loss')
     if not 0.0 <= loss <= 1.0:
         raise ConfigError(f'{where}: largest_loss must be from 0 to 1, not {loss:g}')
-    chain = _chain(given.get('chain'), folder, where, chains)
+    arm = _chain(given.get('chain'), folder, where, chains)
     measured = _measured(own.get('measured'), folder, where)
     since = _moment(own.get('since'), f'{where}: since')
-    return Robot(serial, chain, measured, settings, tolerance, loss, since)
+    return Robot(serial, arm, measured, settings, tolerance, loss, since)
 
 
-def _chain(name: object, folder: Path, where: str, chains: dict[str, Chain]) -> Chain:
+def _chain(name: object, folder: Path, where: str, chains: dict[str, Arm]) -> Arm:
     if not isinstance(name, str) or not name:
         raise ConfigError(f'{where}: give chain, a file or a robot by its name, or a group')
     if name not in chains:
@@ -131,7 +141,7 @@ def _chain(name: object, folder: Path, where: str, chains: dict[str, Chain]) -> 
         try:
             chains[name] = load_chain(path if path.suffix or path.is_file() else name)
         except ConfigError as err:
-            raise ConfigError(f'{where}: {err}') from err
+            chains[name] = ConfigError(f'{err}: correct it, or "chain" in the plant file')
     return chains[name]
 
 

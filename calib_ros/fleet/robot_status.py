@@ -39,12 +39,12 @@ class RobotStatus:
             return cls._of(robot, history.rows(robot.serial), done, years)
         except (CalibrationError, ValueError, KeyError) as err:  # foreign or damaged rows
             found = cls._of(robot, (), done, years)
-            errors = {**found.errors, '': f'its rows in the history cannot be compared: {err}'}
-            return replace(found, errors=errors)
+            told = {'': f'its rows in the history cannot be compared: {err}'}
+            return replace(found, errors={**told, **found.errors})
 
     @classmethod
     def _of(cls, robot: Robot, rows: tuple[Row, ...], done: Run, years: float) -> RobotStatus:
-        own = results(robot, rows)
+        own = results(robot, rows) if rows else ()
         last = own[-1] if own else None
         compared = tuple(row for row in own if robot.compares(row.time))
         known = tuple(r for r in verifications(rows) if robot.compares(r.time))

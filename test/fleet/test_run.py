@@ -17,13 +17,14 @@ from calib_ros.files.history import History
 from calib_ros.files.loading import table
 from calib_ros.files.rows import Row
 from calib_ros.fleet.cluster import Cluster, LostError, done_tasks, workers_of
+from calib_ros.fleet.page import fleet_page
 from calib_ros.fleet.plant import Pattern, read_plant
 from calib_ros.fleet.results import results, verifications
 from calib_ros.fleet.run import Run, run
 from calib_ros.fleet.source_files import SourceFile, sources
 from calib_ros.fleet.status import statuses
 from calib_ros.fleet.tasks import Outcome, Task
-from calib_ros.kinematics.chain_file import chain_document, load_chain
+from calib_ros.kinematics.chain_file import chain_document, dump_chain, load_chain
 
 CHAIN = json.dumps(chain_document(load_chain('ur10e')))
 
@@ -43,6 +44,29 @@ def echoed(task):
     if task.source.url == '150':
         raise RuntimeError('150')  # as dask tells of a worker that has died too often
     return Outcome(error=task.source.url, seconds=0.01)
+
+
+@pytest.mark.parametrize('filed_before', [False, True])
+def test_a_chain_that_cannot_be_read_costs_only_its_robot(plant, cluster, tmp_path, filed_before):
+    """It stopped the whole plant."""
+    history, path, own = (tmp_path / name for name in ('history', 'plant.yaml', 'own.yaml'))
+    text = json.loads(path.read_text())
+    text['robots'][1]['chain'] = 'own.yaml'
+    path.write_text(json.dumps(text))
+    history = History(history)
+    if filed_before:
+        own.write_text(dump_chain(load_chain('ur10e')))
+        run(read_plant(path), history, cluster)
+    own.write_text('joints: [')
+    found = run(read_plant(path), history, cluster, tmp_path / 'report')
+    one, other = statuses(read_plant(path), history, found, 100.0)
+    assert (found.filed, other.state) == (0 if filed_before else 2, 'fine')
+    assert (one.robot.serial, one.states) == ('B', ('unreadable',))
+    assert re.search('own.yaml is not valid YAML.*: correct it, or "chain" in the', *one.unread)
+    assert 'own.yaml' in fleet_page(tmp_path / 'report', (one, other), found)
+    own.unlink()
+    (error,) = run(read_plant(path), history, cluster).errors['B'].values()
+    assert 'own.yaml: No such file' in error
 
 
 def keys(history):
