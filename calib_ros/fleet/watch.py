@@ -45,7 +45,9 @@ from calib_ros.decision.changes import (
     reasons_of,
 )
 from calib_ros.decision.several import Changes, likelier, names_of
+from calib_ros.errors import InputError
 from calib_ros.estimation.levels import CLEARLY, KNOWN, LARGEST_SCALE, SEVERAL, TELLING, chance_of
+from calib_ros.files.history import AWAY
 from calib_ros.files.rows import Row
 from calib_ros.fleet.change import Change
 from calib_ros.identification.age import YEAR, drift_of
@@ -286,6 +288,11 @@ def _information(
         which = [arm.index(name) for name in names]
         tilts = row.tilts[own] if row.tilts.size else np.zeros((len(own), most))
         square = row.covariance[np.ix_(own, own)] - (row.tilt or 0.0) ** 2 * tilts @ tilts.T
+        try:
+            np.linalg.cholesky(square)
+        except np.linalg.LinAlgError as err:
+            where = f'the covariance in {row.key}.parquet of the history'
+            raise InputError(f'{where} is damaged ({err}): {AWAY}') from err
         whole = np.linalg.inv(square + grown[arm] @ grown[arm].T)
         information.append(whole[np.ix_(which, which)])
         pulls.append((whole @ np.column_stack([row.offsets[own], tilts]))[which])

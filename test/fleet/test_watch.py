@@ -12,6 +12,7 @@ import plants
 import pytest
 
 from calib_ros.apply import simulation
+from calib_ros.errors import InputError
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.result_rows import result_row
 from calib_ros.files.rows import Filing
@@ -251,6 +252,10 @@ def test_what_cannot_be_compared_is_told(first, rng):
         '1 night, the last of 2025-10-11, cannot be compared with the newest: '
         f'it alone determines {BUMPS[0]}',
     )
+    for share in (0.0, -1.0):
+        rows[4] = replace(rows[4], covariance=share * first.covariance)
+        with pytest.raises(InputError, match=f'covariance in {rows[4].key}.parquet .* move it'):
+            watch(rows, 100.0)
     assert watch((), 100.0).nights == watch(rows[:1], 100.0).changes == ()
 
 
