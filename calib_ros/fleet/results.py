@@ -13,6 +13,9 @@ from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.identification.age import A_DAY
 
+OLDEST = datetime(2025, 1, 1, tzinfo=timezone.utc)
+"""No result was filed before there was this software: an earlier clock was reset, as to 2002."""
+
 
 def results(robot: Robot, rows: Sequence[Row]) -> tuple[Row, ...]:
     """Return the identifications of a robot with its present settings.
@@ -37,10 +40,14 @@ def verifications(rows: Sequence[Row]) -> tuple[Row, ...]:
 def _unique(rows: Sequence[Row], key: Callable[[Row], object]) -> tuple[Row, ...]:
     """Return rows ordered by time, one for each key.
 
-    Rows filed before their stamps count as measured when filed; those to come do not count.
+    Rows filed before their stamps count as measured when filed, unless the clock had been reset;
+    those to come do not count.
     """
     past = [row for row in rows if not to_come(row)]
-    dated = [replace(row, time=row.filed) if too_late(row) else row for row in past]
+    dated = [
+        replace(row, time=row.filed) if too_late(row) and row.filed > OLDEST else row
+        for row in past
+    ]
     newest = sorted(dated, key=lambda row: (row.software == calib_ros.__version__, row.filed))
     unique = {key(row): row for row in newest}
     return tuple(sorted(unique.values(), key=lambda row: (row.time, row.source, row.key)))

@@ -57,6 +57,11 @@ def test_a_clock_that_is_wrong_hides_no_newer_night(history):
         'c.csv was filed last, and its stamps are of 2023-04-23, before other nights: '
         'unless it is an old one, a clock was set back'
     )
+    reset = {'time': plants.when(5), 'filed': plants.when(-8500), 'source': 'd.csv'}  # to 2002
+    history.file(replace(row, inputs='5', **reset))
+    status = told(history)['A']
+    assert (status.state, status.last.source) == ('fine', 'd.csv')
+    assert status.remarks[0].startswith('2 results with stamps later than the filing')
 
 
 def test_a_result_filed_by_a_clock_ahead_is_told_and_hides_nothing(history):
