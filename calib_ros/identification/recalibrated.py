@@ -65,6 +65,11 @@ class Recalibration(Shown):
         return self.comparison.figures[1]
 
     @property
+    def owners(self) -> set[str]:
+        """Return what has changed, of indistinguishable ones the likeliest."""
+        return {reasons[0].owner for reasons in self.changed}
+
+    @property
     def accepted(self) -> bool:
         """Tell whether the result may be used."""
         most = max(ALIKE * self.before.rms_mm, 1e3 * SAME)  # simulated without noise
@@ -116,18 +121,19 @@ class Recalibration(Shown):
     def with_moved(
         self, frames: Sequence[str], earlier: Chain, found: Recalibration
     ) -> Recalibration:
-        """Return the result, fitted with free `frames`, that names these as the changes.
+        """Return the result, fitted with free `frames`, that names these first as changes.
 
         `earlier` is the arm before, and `found` has its errors.
         """
         updated = self.calibration
-        changed = []
+        changed: list[tuple[Explanation, ...]] = []
         for frame in frames:
             own = [k for k, name in enumerate(updated.names) if Parameter(name).owner == frame]
             names = tuple(Parameter(updated.names[k]) for k in own)
             change = np.array([updated.chain.offset(name, earlier) for name in names])
             sigma = np.sqrt(np.diag(np.asarray(updated.covariance))[own])
             changed.append((Explanation(frame, names, np.inf, 0.0, 1.0, change, sigma),))
+        changed += self.changed
         record = {**updated.record, 'changed': [*map(changes.reason_in_words, changed)]}
         return replace(
             self,

@@ -109,17 +109,17 @@ def recalibrate(
 def _moved_far(
     again: Callable[..., tuple[Recalibration, Chain]], movable: Sequence[str], new: Sequence[str]
 ) -> tuple[Sequence[str], Recalibration] | None:
-    """Return the one movable frame that moved, or all of them, and the result with these new."""
-    for tried in ([(frame,) for frame in movable], [tuple(movable)] * (len(movable) > 1)):
-        found = []
-        for frames in tried:
-            with suppress(InputError, np.linalg.LinAlgError, FloatingPointError):
-                others, _ = again((*new, *frames))
-                if others.accepted and not others.changed:
-                    found.append((frames, others))
-        if found:  # either of two may have moved
-            return found[0] if len(found) == 1 else None
-    return None
+    """Return the frame that moved, or all of them, best without changed joints, and the result."""
+    found: dict[tuple[bool, int], list[tuple[Sequence[str], Recalibration]]] = {}
+    for frames in (*((frame,) for frame in movable), *[tuple(movable)] * (len(movable) > 1)):
+        if len(frames) > 1 and (False, 1) in found:
+            break
+        with suppress(InputError, np.linalg.LinAlgError, FloatingPointError):
+            others, _ = again((*new, *frames))
+            if others.accepted and not others.owners.intersection(movable):
+                found.setdefault((bool(others.changed), len(frames)), []).append((frames, others))
+    likeliest = found[min(found)] if found else []
+    return likeliest[0] if len(likeliest) == 1 else None  # either of two may have moved
 
 
 def _released(previous: Calibration, new: Sequence[str]) -> Calibration:

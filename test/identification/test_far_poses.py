@@ -66,6 +66,17 @@ def test_device_and_target_that_both_moved_far_are_named(earlier):
         assert not recalibrate(earlier[0], seen(12, true=other, **SIGMAS), 0.1).accepted
 
 
+def test_a_device_that_moved_far_and_a_slipped_zero_are_named(earlier):
+    """No change of a few parameters explained them: from so far off the model is not linear."""
+    now, rng = TRUE.with_offsets({'shoulder_lift_joint.theta': 1e-2}), np.random.default_rng(3)
+    now = replace(now, base=random_frame(rng, 2.0))
+    found = recalibrate(earlier[0], seen(16, true=now, **SIGMAS), 0.1)
+    assert found.accepted
+    assert [reasons[0].owner for reasons in found.changed] == ['base', 'shoulder_lift_joint']
+    words = found.calibration.record['changed']
+    assert ['shoulder_lift_joint.theta' in each for each in words] == [False, True]
+
+
 def test_moved_frames_and_a_slipped_zero_are_placed_as_well_as_the_arm_is_known(earlier):
     """The frames were accepted before they converged, 7 mm off."""
     now, rng = TRUE.with_offsets({'elbow_joint.theta': 2e-3}), np.random.default_rng(3)
