@@ -288,12 +288,13 @@ def _information(
         which = [arm.index(name) for name in names]
         tilts = row.tilts[own] if row.tilts.size else np.zeros((len(own), most))
         square = row.covariance[np.ix_(own, own)] - (row.tilt or 0.0) ** 2 * tilts @ tilts.T
+        square += grown[arm] @ grown[arm].T
         try:
             np.linalg.cholesky(square)
         except np.linalg.LinAlgError as err:
             where = f'the covariance in {row.key}.parquet of the history'
             raise InputError(f'{where} is damaged ({err}): {AWAY}') from err
-        whole = np.linalg.inv(square + grown[arm] @ grown[arm].T)
+        whole = np.linalg.inv(square)
         information.append(whole[np.ix_(which, which)])
         pulls.append((whole @ np.column_stack([row.offsets[own], tilts]))[which])
     return np.array(information), np.array(pulls)
