@@ -69,9 +69,18 @@ def stations(sets: Sequence[Observations]) -> tuple[Index, ...]:
     return _split(numbers, sets)
 
 
-def _in_order(sets: Sequence[Observations]) -> tuple[FloatArray, Index]:  # of stamps
+def _in_order(sets: Sequence[Observations]) -> tuple[FloatArray, Index]:
+    """Return all joint values (N, n), and their order by stamps (N,).
+
+    The arm is at one place at a time: if stamps say otherwise, sets come one after another.
+    """
+    joints = np.concatenate([each.joints for each in sets])
     stamps = np.concatenate([each.stamps_ns for each in sets])
-    return np.concatenate([each.joints for each in sets]), np.argsort(stamps, kind='stable')
+    order = np.argsort(stamps, kind='stable')
+    elsewhere = np.abs(np.diff(joints[order], axis=0)).max(axis=1) > STILL
+    if (elsewhere & (np.diff(stamps[order]) == 0)).any():
+        order = np.lexsort((stamps, np.repeat(np.arange(len(sets)), [*map(len, sets)])))
+    return joints, order
 
 
 def _split(values: NDArray[S], sets: Sequence[Observations]) -> tuple[NDArray[S], ...]:
