@@ -51,9 +51,9 @@ def _without_twins(found: Sequence[RobotStatus]) -> Iterator[RobotStatus]:
 
 
 def _silent(found: Sequence[RobotStatus]) -> Iterator[RobotStatus]:
-    """Yield statuses; those without several usual nights before the newest of others are told.
+    """Yield statuses; those that miss several usual nights of two others are told.
 
-    Of nights that one robot alone has, either the others or its own clock may be the reason.
+    So is a robot that alone has such nights: the others stopped, or its clock is ahead.
     """
     usual: dict[str, timedelta] = {}
     for one in found:
@@ -68,8 +68,8 @@ def _silent(found: Sequence[RobotStatus]) -> Iterator[RobotStatus]:
             if newest - last > few:
                 told = (f'nothing measured since {last:%Y-%m-%d}; other robots were',)
             elif last - newest > few:
-                when = f'{newest:%Y-%m-%d}'
-                told = (f'no other robot was measured since {when}: is its clock ahead?',)
+                since = f'no other robot was measured since {newest:%Y-%m-%d}'
+                told = (f'{since}: did they stop, or is its clock ahead?',)
             one = replace(one, remarks=(*one.remarks, *told))
         yield one
 

@@ -94,12 +94,16 @@ def test_a_robot_without_the_nights_of_the_others_is_told_of(history):
             assert not any(remarks(history).values())  # the only one
     silent = ('nothing measured since 2025-10-12; other robots were',)
     assert remarks(history) == {'A': silent, 'B': (), 'C': ()}
-    alone = ('no other robot was measured since 2025-10-12: is its clock ahead?',)
+    alone = (
+        'no other robot was measured since 2025-10-12: did they stop, or is its clock ahead?',
+    )
     assert remarks(history, PLANT[:2]) == {'A': (), 'B': alone}
     history.file(replace(history.rows('A')[-1], time=plants.when(4), inputs='late'))
     assert not any(remarks(history).values())
     history.file(replace(history.rows('C')[-1], time=plants.when(380), inputs='ahead'))
-    alone = ('no other robot was measured since 2025-10-16: is its clock ahead?',)
+    alone = (
+        'no other robot was measured since 2025-10-16: did they stop, or is its clock ahead?',
+    )
     assert remarks(history) == {'A': (), 'B': (), 'C': alone}
 
 
