@@ -207,7 +207,7 @@ def uneven(problem: Problem, result: Identification) -> tuple[str, Problem | Non
     if most == played:
         return (
             f'the joints have play, which explains {explain}: fit the play (model auto), or stop '
-            'at each pose (mode dwell), reached from the same side, in use as well'
+            'at each pose (mode dwell) and come from the same side, in use as well'
         ), None
     if most == scaled:
         k = int(np.argmax(strong))

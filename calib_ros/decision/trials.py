@@ -59,7 +59,7 @@ class Trial:
                 chain = chain.with_frame(name, replace(frame, matrix=frame.matrix[self.number]))
         return chain
 
-    @cached_property
+    @property
     def error(self) -> float:
         """Return the error [m] that a usual share of the samples is within."""
         return float(_usual(self._sizes))
@@ -74,7 +74,7 @@ class Trial:
         """Return the error in units of the spread."""
         return self.error / max(self.spread, 1e-9)
 
-    @property
+    @cached_property
     def _sizes(self) -> FloatArray:
         pairs = zip(self.sets, self.arms, strict=True)
         return np.concatenate([sample_errors(self.chain, each, arm) for each, arm in pairs])
