@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib_ros.decision.delays import wrong_ratio
 from calib_ros.decision.improvement import gain_refusals, harm_refusals
 from calib_ros.decision.moved import Step
 from calib_ros.decision.reasons import Reason, Rule
@@ -146,6 +147,8 @@ def oddities(
     if steps:
         each = [f'{step} ({", ".join(names)})' for step, names in steps.items()]
         found.append(f'joint values are multiples of {", ".join(each)}: record more digits')
+    ratios = [n for n in effects.members(posterior.chain, 'ratio') if n in posterior.names]
+    found += [wrong_ratio(name.owner, posterior.chain.value(name)) for name in ratios]
     listed, chain = problem.chain.parallel or (), problem.chain
     ours = replace(chain, parallel=None).parallel or ()
     for names, others, does, are in ((ours, listed, 'omits', ''), (listed, ours, 'has', 'not ')):

@@ -189,6 +189,18 @@ def _rows(problem: Problem) -> tuple[Fitted, list[FloatArray]]:
     ]
 
 
+def wrong_ratio(joint: str, ratio: float, why: str = '') -> str:
+    """Return that a joint moves more or less than its values; empty if by less than 1 %.
+
+    Arms that bend seem to.
+    """
+    if abs(ratio) < EXCEPTION**2:
+        return ''
+    size = f'{two_digits(100.0 * abs(ratio))} % {"more" if ratio > 0.0 else "less"}'
+    remedy = 'correct its gear ratio or the count of its encoder'
+    return f'{joint} moves {size} than its values{why}: {remedy}'
+
+
 def uneven(problem: Problem, result: Identification) -> tuple[str, Problem | None] | None:
     """Return what explains most of the residuals, and the problem without it; None if nothing.
 
@@ -211,15 +223,10 @@ def uneven(problem: Problem, result: Identification) -> tuple[str, Problem | Non
         ), None
     if most == scaled:
         k = int(np.argmax(strong))
-        if abs(ratio[k]) < EXCEPTION**2:  # as arms that bend seem to have
+        if not (said := wrong_ratio(ratios[k].owner, ratio[k], f', which explains {explain}')):
             return None
         delays, ratio = 0.0 * delays, ratio * (np.arange(len(ratio)) == k)
-        text: str = Reason(
-            Rule.MISTAKE,
-            f'{ratios[k].owner} moves {two_digits(100.0 * abs(ratio[k]))} % '
-            f'{"more" if ratio[k] > 0.0 else "less"} than its values, which explains {explain}: '
-            'correct its gear ratio or the count of its encoder',
-        )
+        text: str = Reason(Rule.MISTAKE, said)
     else:
         ratio = 0.0 * ratio
         text = (

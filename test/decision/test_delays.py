@@ -58,6 +58,9 @@ def test_a_wrong_gear_ratio_is_no_delay(joint, scale):
     size = float(told[2]) * (1.0 if told[3] == 'more' else -1.0)
     assert size == pytest.approx(100.0 / scale - 100.0, rel=0.1)
     assert not any('delay changes' in each for each in result.remarks)
+    fitted = identify(Problem(UR10E, seen, **SIGMAS, effects=[f'{told[1]}.ratio']))
+    assert fitted.accepted  # the table cannot carry it
+    assert re.match(rf'{told[1]} moves {told[2][:2]}.* % {told[3]} than', fitted.remarks[-1])
 
 
 def test_a_delay_that_changes_is_undone_where_the_arm_moved():
