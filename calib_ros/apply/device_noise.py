@@ -20,7 +20,7 @@ import numpy as np
 from scipy import special
 
 from calib_ros.decision.changes import SIZES
-from calib_ros.estimation.levels import CERTAIN, CONFIDENT
+from calib_ros.estimation.levels import CERTAIN
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.system import row_samples, stacked
@@ -74,9 +74,7 @@ def noise_seen(chain: Chain, sets: Sequence[Observations]) -> float:
         some = columns[:, [name in cause for name in names]]
         still = some @ some.T
         kernels += [still, still * np.minimum.outer(when, when)] if still.any() else []
-    freedom = special.chdtri(len(errors), CONFIDENT)
-    variance = _white(kernels, errors) * len(errors) / freedom
-    return float(np.sqrt(variance) * problem.sigma_position)
+    return float(np.sqrt(_white(kernels, errors)) * problem.sigma_position)
 
 
 def _white(kernels: Sequence[FloatArray], errors: FloatArray) -> float:
@@ -88,9 +86,7 @@ def _white(kernels: Sequence[FloatArray], errors: FloatArray) -> float:
         values, axes = np.linalg.eigh(kernel * (count / np.trace(kernel)))
         variances = 1.0 + sizes * np.maximum(values, 0.0)
         white = np.mean((axes.T @ errors) ** 2 / variances, axis=1)
-        log = -0.5 * (count * np.log(np.maximum(white, 1e-300)) + np.log(variances).sum(axis=1))
-        log[1:] -= np.log(len(kernels))  # each cause is as likely as another
-        logs.append(log)
+        logs.append(count * np.log(np.maximum(white, 1e-300)) + np.log(variances).sum(axis=1))
         whites.append(white)
-    likely = np.array(logs) >= np.max(logs) - 0.5 * special.chdtri(1.0, 1.0 - CERTAIN)
+    likely = np.array(logs) <= np.min(logs) + special.chdtri(1.0, 1.0 - CERTAIN)
     return float(np.array(whites)[likely].max())

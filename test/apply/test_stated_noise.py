@@ -9,6 +9,7 @@ import pytest
 from fits import measured_arm
 from verified import NOISE, UR, measured
 
+from calib_ros.apply.device_noise import noise_seen
 from calib_ros.apply.judgement import judge
 from calib_ros.apply.verification import verify
 from calib_ros.cli.common import settings_of
@@ -136,6 +137,23 @@ def test_few_poses_tell_no_noise_from_a_change(cell, arm, count, worse, seed):
         assert not any('State the noise' in each for each in standing(told)[1])
     rows[count // 2 :] = np.nan  # the others are as noisy, and nobody said so
     assert verify(arm, [replace(seen, covariance=rows)], None).needed is None
+
+
+@pytest.mark.parametrize('seed', [0, 9])
+def test_the_noise_of_few_poses_is_the_most_that_is_likely(cell, seed):
+    """The likeliest cause left 0.33 and 0.001 mm of 1 mm, and condemned healthy arms."""
+    rng = np.random.default_rng(seed)
+    seen = measured(cell[0], UR.random_joints(6, rng), 1, (1e-3, NOISE[1]), seed)
+    assert noise_seen(cell[0], [seen]) > 7e-4
+
+
+def test_links_that_are_all_bent_are_one_cause(cell):
+    """Only beside all else that may change, 0.2 to 1 mm of them were taken for noise."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        links = {name: 5e-4 * rng.choice([-1, 1]) for name in UR.parameter_names if name.of_dh}
+        seen = measured(cell[0].with_offsets(links), UR.random_joints(8, rng), 1, seed=seed)
+        assert noise_seen(cell[0], [seen]) < 2e-4
 
 
 @pytest.mark.parametrize(
