@@ -111,6 +111,13 @@ def test_the_coarse_search_is_a_tenth_of_the_shorter_side_apart(count):
     assert not len(scan._some_places(2 * LEAST_ASIDE - 1))
 
 
+def test_poses_that_spare_no_more_than_a_step_takes_show_none():
+    """It was a division by zero."""
+    *_, seen = measured_arm(0, 7)
+    fitted = fitting.fit(Problem(UR10E, seen, sigma_position=1e-5, sigma_orientation=5e-5))
+    assert find_step(fitted) is None
+
+
 def test_a_step_between_places_of_the_coarse_search_may_explain_just_enough(monkeypatch):
     fitted = bumped()
     monkeypatch.setattr(scan, '_some_places', lambda _: np.array([AT - 4, AT + 4]))

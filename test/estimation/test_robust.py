@@ -7,6 +7,7 @@ import pytest
 from fits import NO_PRIOR, NOISE, UR10E, directions, fitted, measured_arm, rms, spoiled
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.estimation import fitting
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.identification import identify
@@ -248,6 +249,14 @@ def test_the_only_poses_of_a_branch_are_no_gross_errors(unsearched, seed):
     assert result.accepted
     assert len(result.outliers) < 3
     assert after < 0.2 * before
+
+
+def test_few_poses_with_more_noise_than_stated_have_no_gross_errors():
+    """The best half leaves so little that others looked like some: errors grew by 10 to 80 %."""
+    for seed in range(2):
+        noise = (10.0 * NOISE[0], 0.0)
+        *_, seen = measured_arm(seed, 14, noise, oriented=False)
+        assert not fitting.fit(problem(seen)).robust.outliers.any()
 
 
 def test_an_even_spread_of_many_samples_tells_the_gross_errors_of_all(unsearched, monkeypatch):
