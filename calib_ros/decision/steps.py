@@ -78,7 +78,8 @@ def find_step(fitted: Fitted) -> Step | None:
         torn = found.group.kind in IN_THE_CELL and scan.tears(found.group, found.sizes[0])
         scan = scan if torn else Scan(fitted, loaded=bends, gross=0)  # others are no move
         found = found if torn else _imitated(scan, fitted)
-    return None if found is None else _described(scan, found, quiet)
+    step = None if found is None else _described(scan, found, quiet)
+    return step if step is not None and step.harmful else None  # else nothing was imitated
 
 
 def _searched(fitted: Fitted, loaded: bool, gross: int = 2) -> tuple[Scan, _Found | None]:
