@@ -231,8 +231,8 @@ def uneven(problem: Problem, result: Identification) -> tuple[str, Problem | Non
         ratio = 0.0 * ratio
         text = (
             f'joints late by different times explain {explain}, above all '
-            f'{play[int(np.argmax(late))].owner}: read all joints at one moment, look for wrong '
-            'speeds, or stop at each pose (mode dwell)'
+            f'{play[int(np.argmax(late))].owner}: read all joints at one moment, unfiltered, look '
+            'for wrong speeds, or stop at each pose (mode dwell)'
         )
     sets = []
     for each in problem.sets:

@@ -258,13 +258,19 @@ def test_another_target_of_a_scara_leaves_its_device_where_it_stands(seed, orien
 
 
 @pytest.mark.parametrize('earlier', [True], indirect=True)
-def test_a_slip_between_a_device_and_a_target_far_away_asks_for_new_frames(earlier, none_odd):
-    """The remedy was to identify again."""
+def test_a_slip_between_a_device_and_a_target_far_away_is_named_beside_both(earlier):
+    """Another arm there asks for new frames: the remedy was to identify again."""
     true, previous, oriented = earlier
     rng = np.random.default_rng(1)
-    there = slipped(true, [0.0, 0.0, 3e-3, 0.0, 0.0, 0.0])
-    there = replace(there, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
-    why, step = recalibrate(previous, problem(there, 8, 1, oriented), 0.1).refusal()
+    away = {'base': random_frame(rng, 2.0), 'tool': random_frame(rng, 0.2)}
+    there = replace(slipped(true, [0.0, 0.0, 3e-3, 0.0, 0.0, 0.0]), **away)
+    found = recalibrate(previous, problem(there, 8, 1, oriented), 0.1)
+    assert found.accepted
+    assert owners(found.changed) == [{'base'}, {'tool'}, {'elbow_joint'}]
+    q = true.random_joints(300, rng)
+    assert rms(found.calibration.chain, there, q) < 2.0 * rms(previous.chain, true, q)
+    other = replace(faulty(UR10E, Cell(), np.random.default_rng(9)), **away)
+    why, step = recalibrate(previous, problem(other, 8, 1, oriented), 0.1).refusal()
     assert why == 'no change of a few parameters explains the new poses'
     assert step.startswith('if the device or the target was moved, give --new-base or --new-tool')
 
