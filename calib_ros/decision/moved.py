@@ -37,7 +37,7 @@ class Step:
     residuals beyond that of as many useless parameters. If all measurements on one side are
     outliers, `unused` says which: the fit of frames is not affected. If the arm's places before
     and after lie `apart`, its errors may look like a step of that size. So do those of the joint
-    `turned`, which seldom moved, but did so just before: by chance a step is hardly there.
+    `turned`, which seldom moved but did just before: a true step is hardly there by chance.
     """
 
     owners: tuple[str, ...]
