@@ -22,7 +22,7 @@ from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.system import row_samples, stacked
-from calib_ros.estimation.visits import numbered, stations
+from calib_ros.estimation.visits import numbered
 from calib_ros.identification import identification
 from calib_ros.identification.identification import identify
 from calib_ros.identification.model_choice import identify_model
@@ -55,19 +55,6 @@ def test_what_moves_between_stations_is_no_gain(seed):
         assert result.validated_by.startswith('3-fold cross-validation over 3 different stations')
         assert [each.rule for each in result.refusals] == [Rule.GAIN]
         assert 'move all joints from pose to pose' in str(result.refusals[0])
-
-
-@pytest.mark.filterwarnings('error')
-@pytest.mark.parametrize('scatter', [0.0, 4e-4])
-def test_few_stations_are_told_from_poses(scatter, rng):
-    q = UR10E.random_joints(48, rng)
-    for first, wanted in ((4, 4), (16, 48), (1, 48)):
-        still = np.repeat(q[:first, :3], 48 // first, axis=0)
-        joints = np.concatenate([still, q[:, 3:]], axis=1)
-        seen = measure(UR10E, joints + scatter * rng.normal(size=q.shape), rng)
-        (numbers,) = stations([seen])
-        assert len(set(numbers.tolist())) == wanted
-    assert stations([seen.select(slice(1))])[0].tolist() == [0]
 
 
 @pytest.mark.parametrize(('scatter', 'visits'), [(3e-4, 5), (2e-3, 2), (4e-3, 5)])

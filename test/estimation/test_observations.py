@@ -8,7 +8,6 @@ import pytest
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import SCATTER, STILL, configurations
 from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.visits import sided
 from calib_ros.kinematics import se3
 
 
@@ -81,28 +80,6 @@ def test_speeds_tell_from_which_side_joints_came(rng):
     assert (replace(seen, velocity=speeds, approach=known).approach == known).all()
     with pytest.raises(InputError, match=r'^velocity of the observations hold NaN'):
         replace(seen, velocity=np.nan * speeds)
-
-
-def test_sides_follow_from_the_order_of_all_stops_where_no_signs_are_stated():
-    joints = np.array([[0.0, 1.0], [0.1, 1.0], [0.1, 1.0], [0.3, 0.5], [0.2, 0.5]])
-    every = Observations.from_arrays(joints, np.zeros((5, 3)))
-    wanted = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, -1.0], [-1.0, -1.0]])
-    even, odd = every.select(np.array([4, 0, 2])), every.select(np.array([1, 3]))
-    first, second = sided([even, odd])
-    np.testing.assert_array_equal(first.approach, wanted[[4, 0, 2]])
-    np.testing.assert_array_equal(second.approach, wanted[[1, 3]])
-    stated = replace(odd, approach=-np.ones((2, 2)))
-    assert sided([even, stated])[1] is stated
-
-
-def test_sets_whose_stamps_disagree_where_the_arm_was_come_one_after_another():
-    """Of two sets stamped by row 11 of 12 arms with play were accepted, 9 worse than nominal."""
-    joints = np.array([[0.0], [0.1], [0.3], [0.2], [0.5], [0.4]])
-    places = np.zeros((6, 3))
-    every = Observations.from_arrays(joints, places)
-    halves = [Observations.from_arrays(joints[k], places[k]) for k in np.split(np.arange(6), 2)]
-    found = np.concatenate([each.approach for each in sided(halves)])
-    np.testing.assert_array_equal(found, sided([every])[0].approach)
 
 
 def test_a_plane_needs_heights():
