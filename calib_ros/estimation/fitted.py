@@ -97,7 +97,9 @@ class Fitted:
     def sided(self) -> System:
         """Return these samples with signs of the last moves (`visits.sided`)."""
         seen = sided([samples.observations for samples in self.system.sets])
-        pairs = zip(self.system.sets, seen, strict=True)
+        pairs = [*zip(self.system.sets, seen, strict=True)]
+        for samples, each in pairs:
+            vars(each)['by_joint'] = samples.observations.by_joint  # known
         return replace(self.system, sets=tuple(samples.of(each) for samples, each in pairs))
 
     def good_sets(self, most: int = SOME_POSES) -> list[Observations]:
