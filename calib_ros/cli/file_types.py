@@ -69,6 +69,8 @@ def kind_of(path: Path) -> str:
     for mark, kind in BEGINNINGS:
         if begin[:16].lower().startswith(mark.lower()):
             return kind
+    if b' jointtarget ' in begin[:100]:  # RAPID without its MODULE
+        return 'native'
     kind = 'urdf' if b'<robot' in begin else _by_suffix(path.name)
     return 'program' if kind == 'chain' and b'points:' in begin else kind
 

@@ -343,13 +343,11 @@ class _Table:
 def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
     """Return a column that names the poses of both, if any, and the row in the log of each.
 
-    If one names most of them, the others are refused. Numbers may only count the rows of
-    each: they name poses if no words do.
+    If one names most, the others are refused. Numbers may count rows: words come first.
     """
     refused = ''
-    both = product(
-        sorted(table.labels(log), key=lambda each: each[0] != ''), [*log.labels(table)]
-    )  # words first
+    first = sorted(table.labels(log), key=lambda each: each[0] != '')
+    both = product(first, [*log.labels(table)])
     for (kind, name, named), (same, theirs, logged) in both:
         if kind and refused:
             break
@@ -370,23 +368,26 @@ def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
             )
     if refused:
         raise InputError(refused)
-    _refuse_other_order(table, log)
-    return '', np.arange(log.count)
+    return _by_numbers(table, log)
 
 
-def _refuse_other_order(table: _Table, log: _Table) -> None:
-    """Refuse rows that stand side by side but have the same numbers in another order."""
+def _by_numbers(table: _Table, log: _Table) -> tuple[str, Index]:
+    """Return rows side by side, or, if some were left out, of one number in names (7, Motion7)."""
     both = [*product(table.numbered(), log.numbered())]
     if any(numbers == logged for (_, numbers), (_, logged) in both):
-        return
+        return '', np.arange(log.count)
     for (name, numbers), (theirs, logged) in both:
         if Counter(numbers) == Counter(logged):
             raise InputError(
                 f'the numbers in the column {name} of {table.path} come in another order in the '
-                f'column {theirs} of {log.path}: if they name the poses, write the same '
-                'names, each once, below the same header; if all rows stand side by side, leave '
-                'one of these columns out'
+                f'column {theirs} of {log.path}: if they name the poses, write the same names, '
+                'each once, below the same header; if all rows stand side by side, leave one of '
+                'these columns out'
             )
+        skip = np.ptp(np.array(numbers, float)) >= len(numbers) == len({*numbers})
+        if skip and {*numbers} <= {*logged} and len({*logged}) == len(logged):
+            return name, np.array([logged.index(number) for number in numbers])
+    return '', np.arange(log.count)
 
 
 def _shifted(made: Columns, shift: int) -> Columns:

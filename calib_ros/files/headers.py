@@ -121,7 +121,7 @@ def named_by_option(
             f'Several columns are called {", ".join(several)}: rename all but one, or give each '
             f'by its number: {given}'
         )
-    if len(numbers := numbers_in(header)) >= len(missing):
+    if len(numbers := numbers_in(header, len(missing))) >= len(missing):
         given = option(missing, numbers[: len(missing)])
         return f'Its first line holds numbers, not names: {given}, in its order'
     names = joint_columns(joints)

@@ -218,11 +218,16 @@ def named_in(header: Sequence[str], joint: str) -> str:
     return (same or longer * (len(longer) == 1) or [''])[0]
 
 
-def numbers_in(header: Sequence[str]) -> list[str]:
-    """Return the numbers `#k` of columns that a header calls by values, as a row without one."""
+def numbers_in(header: Sequence[str], count: int) -> list[str]:
+    """Return the numbers `#k` of columns that a header calls by values, as a row without one.
+
+    Whole numbers before `count` others may count the rows; a row of a program has brackets.
+    """
     whole = [k for k, name in enumerate(header, 1) if re.fullmatch(r'-?[\d.,]+(e[+-]?\d+)?', name)]
-    values = sum(re.search('[.,]', header[k - 1]) is not None for k in whole)  # 1 may be a name
-    return [f'#{k}' for k in whole] * (len(whole) == len(header) or values > 1)
+    values = [k for k in whole if re.search('[.,]', header[k - 1])]
+    if re.search(r'[={\[(]', ''.join(header)) or not (len(whole) == len(header) or values[1:]):
+        return []
+    return [f'#{k}' for k in (values if len(values) == count else whole)]
 
 
 def _no_joint(name: str) -> bool:
@@ -241,7 +246,7 @@ def _rank(name: str) -> int:
 
 def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:
     """Return the names in a header that count the joints, with a star for the number from 1."""
-    if len(numbers := numbers_in(header)) >= max(joints, 1):
+    if len(numbers := numbers_in(header, joints)) >= max(joints, 1):
         whole = len(numbers) == len(header)
         return {'q*': '#*'} if whole else dict(zip(joint_columns(joints), numbers, strict=False))
     names = [name for name in header if not _no_joint(name)]

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from calib_ros.errors import ConfigError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.records import Owner
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
@@ -136,12 +136,18 @@ def socket_place(label: str) -> str:
 
 
 def socket_pairs(samples: Iterable[Sample], frames: Frames) -> list[tuple[str, str]]:
-    """Return the base frames of the two sockets of each location."""
-    ends: dict[tuple[str, str], dict[str, None]] = {}
+    """Return the base frames of the two sockets of each location; refuse more."""
+    ends: dict[tuple[str, str], dict[str, str]] = {}
     for sample in samples:
         if sample.socket:
-            location = sample.session, sample.device.rpartition('_')[0]
-            ends.setdefault(location, {})[frames.of(sample)[0]] = None
+            location, _, socket = sample.device.rpartition('_')
+            ends.setdefault((sample.session, location), {})[frames.of(sample)[0]] = socket
+    for (_, location), found in ends.items():
+        if len(found) > 2:
+            raise InputError(
+                f'location {location} has the sockets {", ".join(found.values())}: the distance '
+                'known is that of two (give the others a location of their own)'
+            )
     return [(one, other) for one, other in (each for each in ends.values() if len(each) == 2)]
 
 

@@ -110,7 +110,7 @@ def bad_inputs():
         "start.dtx is a program in a robot's own language, but --joints takes a table: write",
     )
     yield 'a program by its beginning', (*bag_of, 'good.csv', '--joints', 'part.dat'), 'but --jo'
-    for given in ('rapid.txt', 'fanuc.txt', 'universal.csv'):
+    for given in ('rapid.txt', 'part.csv', 'fanuc.txt', 'universal.csv'):
         yield (
             f'a program in {given}',
             (*bag_of, 'good.csv', '--joints', given),
@@ -148,6 +148,7 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     (tmp_path / 'move.dat').write_text('&ACCESS RVP\nDEFDAT MOVE\nENDDAT\n')
     (tmp_path / 'part.dat').write_text('DEFDAT MOVE\nDECL E6AXIS XP1={A1 1.0,A2 2.0}\nENDDAT\n')
     (tmp_path / 'rapid.txt').write_text('MODULE Cal\n  CONST jointtarget p1:=[[1,2]];\n')
+    (tmp_path / 'part.csv').write_text('LOCAL VAR jointtarget j1 = j:{1.5,2.5  ,0 } {EJ 0}\n')
     (tmp_path / 'fanuc.txt').write_text('/PROG  CAL\n/POS\nP[1]{\n  J1= 1.0 deg\n};\n')
     (tmp_path / 'universal.csv').write_text('def cal():\n  movej([1.0, 2.0])\nend\n')
     (tmp_path / 'start.dtx').write_text('<?xml version="1.0"?><Database/>')

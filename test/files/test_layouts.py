@@ -17,6 +17,7 @@ from calib_ros.files.layouts import Layout, layout_of, load_layout
 from calib_ros.kinematics.chain import Joint
 from calib_ros.kinematics.chain_file import load_chain, shared_files
 
+GAPS = 'No,x,y,z\n4,4,0,0\n5,5,0,0\n7,7,0,0\n8,8,0,0\n'  # 6 was not measured
 FOUR = 'a,1,0,0\nb,2,0,0\nc,3,0,0\nd,4,0,0\n'
 
 
@@ -307,6 +308,7 @@ def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_h
         ('A,P2,2,0,0\nA,P10,10,0,0\n', 'Point,q1\nP[10],10\nP[2],2\n', ''),
         ('Point,x,y,z\nP1.1,2,0,0\nP11,1,0,0\n', 'Position,q1\nP1.1,2\nP11,1\n', ''),
         ('No,At,x,y,z\n1,a,1,0,0\n2,b,2,0,0\n', 'No,At,q1\n1,b,2\n2,a,1\n', ''),
+        (GAPS, 'At,q1\nMotion4,4\nMotion6,6\nMotion5,5\nMotion8,8\nMotion07,7\n', ''),
         ('Target,x,y,z\na,1,0,0\nb,2,0,0\na,1,0,0\nb,2,0,0\n', 'At,q1\nb,2\na,1\n', ''),
         ('Point,x,y,z\na,1,0,0\na,1,0,0\nb,2,0,0\n', 'At,q1\nb,2\nc,9\na,1\n', ''),
         (f'Point,x,y,z\na,1,0,0\n{FOUR}', 'At,q1\na,1\nb,2\nc,3\nd,4\n', '"a"'),

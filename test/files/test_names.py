@@ -44,6 +44,12 @@ def test_columns_of_a_table_without_a_header_are_proposed_by_their_numbers(tmp_p
     log.write_text(''.join(sorted(log.read_text().splitlines(True), reverse=True)))
     table = read_table(path, 2, foreign=Foreign(layouts[1], ARM, log, layouts[0]))
     np.testing.assert_array_equal(table.fitted[0].joints, JOINTS)
+    path.write_text(''.join(f'{k}, {line}\n' for k, line in enumerate(lines)))
+    with pytest.raises(InputError, match='names: --columns "x=#2,y=#3,z=#4", in its order'):
+        read_table(path, 2, foreign=Foreign(Layout(), ARM, log, layouts[0]))
+    log.write_text(3 * 'p={0.1,-0.2,0.5,9}\n')  # #2 and #3 are not q1 and q2
+    with pytest.raises(InputError, match=r'give --columns "q\*=NAME\*" \(of a program, write its'):
+        read_table(path, 2, foreign=Foreign(layouts[1], ARM, log))
 
 
 @pytest.mark.parametrize('header', ['Q1,Q2,X,Y,Z', 'Shoulder [rad],elbow,X [m],Y [m],z [m]'])

@@ -2,14 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """A ball that sits in sockets, captured live as a table tells it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from in_sockets import DISTANCE, IIWA, cell
 from streams import joint_state, of_joints, take
 
-from calib_ros.errors import ConfigError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.journal import Journal, read_journal
 from calib_ros.files.tables import read_table
+from calib_ros.sampling.dataset import dataset_of
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
@@ -84,6 +87,9 @@ def test_a_moving_arm_and_a_wrong_label_are_refused():
     take(session, *moving)
     count, why = session.capture('A/1')
     assert (count, 'has not been still' in why) == (0, True)
+    three = [replace(session.samples[0], device=f'A_{k}') for k in range(3)]
+    with pytest.raises(InputError, match='location A has the sockets 0, 1, 2: the distance known'):
+        dataset_of(three, session.settings.sigmas)
     for label in ('A', '/1', 'A/', 'A/1_2', 'A/B/1', 'A/\n'):
         with pytest.raises(ConfigError, match='LOCATION/SOCKET'):
             session.capture(label)
