@@ -346,8 +346,10 @@ def _step_of(scan: Scan, found: _Found, number: int) -> Step | None:
         size, unit = float(max(offsets, key=abs)), Parameter(group.names[0]).unit
     elif oriented and turn * problem.sigma_position > size * problem.sigma_orientation:
         size, unit = turn, 'rad'
-    weights = np.concatenate([scan.weights[k] for k in group.sets])
-    later = np.concatenate(after)
+    weights, counts = (
+        np.concatenate([each[k] for k in group.sets]) for each in (scan.weights, scan.numbers)
+    )
+    later, near = counts >= place, range(place - LEAST_ASIDE + 1, place + LEAST_ASIDE)
     sides = (BEFORE_THAT, ~later), (FROM_THERE, later)
     most = fault_limit(problem) if unit == 'm' else problem.largest_angle
     if found.slow and abs(size) > CLEARLY * most:
@@ -368,7 +370,7 @@ def _step_of(scan: Scan, found: _Found, number: int) -> Step | None:
         share=found.share,
         unused=''.join(unused),
         where=place_of(problem, of_set, int(sample)),
-        apart=abs(size) <= most and _separable(joints, later),
+        apart=abs(size) <= most and any(_separable(joints, counts >= k) for k in near),
         turned=_turned(scan, found.stops) if abs(size) <= most and not found.slow else '',
         held=bool(held),
         slow=found.slow,

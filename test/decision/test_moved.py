@@ -4,10 +4,16 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
+from fits import NOISE, SIGMAS, UR10E, arm
 
+from calib_ros import Problem
+from calib_ros.apply.simulation import measure
 from calib_ros.decision.moved import ASIDE, BEFORE_THAT, FROM_THERE, IF_IN_ORDER, Step
 from calib_ros.decision.reasons import Rule
+from calib_ros.decision.steps import find_step
+from calib_ros.estimation import fitting
 
 AGAIN = ', measure again after ~/clear'
 SIZE = 1.234e-3
@@ -158,3 +164,19 @@ def test_several_zeros_are_of_the_arm():
     )
     assert step.reason.rule is Rule.ENCODER
     assert replace(step, unused=FROM_THERE).harmful
+
+
+@pytest.mark.parametrize(('seed', 'sample'), [(3, 19), (31, 22)])
+def test_a_foot_that_bends_seems_to_move_near_where_poses_lie_apart(seed, sample):
+    """Three Panda arms, measured in front and then behind: their foot "moved by 2 mm"."""
+    rng, last = np.random.default_rng(seed), np.arange(26) >= 20
+    true = arm(rng)
+    q = UR10E.random_joints(26, rng)
+    q[:, 1] = np.where(last, -2.6, -1.6) + rng.uniform(-0.25, 0.25, 26)
+    q[:, 0] = np.where(last, 2.4, 0.4) + rng.uniform(-0.4, 0.4, 26)
+    seen = measure(true, q, rng, *NOISE, oriented=False)
+    tilt = np.outer(3e-3 * true.forward(q)[:, 0, 3], [0, 1, 0])
+    bent = replace(seen, positions=seen.positions + np.cross(tilt, seen.positions))
+    step = find_step(fitting.fit(Problem(UR10E, bent, **SIGMAS)))
+    assert (step.kind, step.sample) == ('base', sample)
+    assert 'poses before and after lie apart' in str(step)
