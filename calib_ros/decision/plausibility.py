@@ -77,7 +77,7 @@ def add_remarks(problem: Problem, result: Identification, another: bool = True) 
         refusals.append(Reason(Rule.MISTAKE, lens))
         lens = ''
     if another and (several := _sessions(problem, result)):
-        refusals.append(Reason(Rule.MISTAKE, several))
+        refusals.insert(0, Reason(Rule.MISTAKE, several))  # before a move between them
     sigmas = _sigmas(problem, result)
     if sigmas and refusals:
         refusals.append(Reason(Rule.MISTAKE, sigmas))
@@ -115,8 +115,8 @@ def _sessions(problem: Problem, result: Identification) -> str:
         mine = [s for s in sessions if any(each.base == o.base or each.tool == o.tool for o in s)]
         sessions = [s for s in sessions if s not in mine]
         sessions.append([o for s in mine for o in s] + [each])
-    moved = {each.rule for each in result.refusals} & {Rule.ENCODER, Rule.MOVED}
-    if len(sessions) < 2 or moved:
+    explained = result.step is not None and result.step.share > 1.0 - EXCEPTION**2
+    if len(sessions) < 2 or explained:
         return ''
     worst = 0.0
     for session in sessions:

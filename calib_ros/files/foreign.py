@@ -212,9 +212,8 @@ class _Table:
         theirs = {*map(str.lower, self._chain.joint_names)} if self._chain else set[str]()
         for name, ours in own.items():
             found = places(self._sheet.header, name) or places(lower, name.lower())
-            if ours in kept or ours in self._columns or not found:
-                continue
-            if len(found) > 1 and ours not in (*WORDS, *QUATERNION):
+            again = len(found) > 1 and ours not in (*WORDS, *QUATERNION)
+            if ours in kept or ours in self._columns or not found or again:
                 continue
             column = only_index(found, name)
             bare, unit = name_and_unit(self._sheet.header[column])
@@ -349,9 +348,7 @@ def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
     first = sorted(table.labels(log), key=lambda each: each[0] != '')
     both = product(first, [*log.labels(table)])
     for (kind, name, named), (same, theirs, logged) in both:
-        if kind and refused:
-            break
-        if kind != same:
+        if kind != same or (kind and refused):
             continue
         ours, others = Counter(named), Counter(logged)
         again = sum(count for count in ours.values() if count > 1)

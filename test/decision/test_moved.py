@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from fits import NOISE, SIGMAS, UR10E, arm
 
-from calib_ros import Problem
+from calib_ros import Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.moved import ASIDE, BEFORE_THAT, FROM_THERE, IF_IN_ORDER, Step
 from calib_ros.decision.reasons import Rule
@@ -180,3 +180,22 @@ def test_a_foot_that_bends_seems_to_move_near_where_poses_lie_apart(seed, sample
     step = find_step(fitting.fit(Problem(UR10E, bent, **SIGMAS)))
     assert (step.kind, step.sample) == ('base', sample)
     assert 'poses before and after lie apart' in str(step)
+
+
+@pytest.mark.parametrize(
+    ('slip', 'said'), [(True, 'the zero of elbow'), (False, 'one arm does not fit all sessions')]
+)
+def test_another_robot_is_no_joint_that_slipped_between_two_sessions(slip, said):
+    """Three Panda arms in one table: "a joint lost its zero while you measured"."""
+    rng = np.random.default_rng(2)
+    true = arm(rng)
+    other = true.with_offsets({'elbow_joint.theta': 5e-3}) if slip else arm(102)
+    first, second = (
+        measure(each, UR10E.random_joints(40, rng), rng, *NOISE, oriented=False)
+        for each in (true, other)
+    )
+    late = second.stamps_ns + 10**12
+    second = replace(second, base='base_two', tool='tool_two', stamps_ns=late)
+    result = identify(Problem(UR10E, first, more=(second,), **SIGMAS))
+    assert result.step.kind.startswith('joint')
+    assert said in result.refusals[0]

@@ -140,9 +140,8 @@ class Posed:
         ({'alone': (0.1, 3.1)}, ''),
         ({'alone': (0.1, InputError('too few'))}, ''),
         ({'consistent': True}, ''),
-        ({'rules': (Rule.ENCODER,)}, ''),
-        ({'rules': (Rule.MOVED,)}, ''),
-        ({'rules': (Rule.GAIN,)}, '20.0 times'),
+        ({'moved': 0.999}, ''),
+        ({'moved': 0.98}, '20.0 times'),
     ],
 )
 def test_two_sessions_are_of_one_arm_unless_each_fits_far_better_alone(change, told, monkeypatch):
@@ -161,8 +160,8 @@ def test_two_sessions_are_of_one_arm_unless_each_fits_far_better_alone(change, t
     monkeypatch.setattr(plausibility, 'fit', fit)
     monkeypatch.setattr(plausibility.Observations, 'some_images', lambda each: each)
     noise = SimpleNamespace(consistent=change.get('consistent', False), position=10.0)
-    refusals = [SimpleNamespace(rule=rule) for rule in change.get('rules', ())]
-    result = SimpleNamespace(noise=noise, refusals=refusals)
+    step = SimpleNamespace(share=change['moved']) if 'moved' in change else None
+    result = SimpleNamespace(noise=noise, step=step)
     found = plausibility._sessions(Posed((first, second)), result)
     assert told in found
     assert bool(found) == bool(told)
