@@ -346,9 +346,8 @@ def _step_of(scan: Scan, found: _Found, number: int) -> Step | None:
         size, unit = float(max(offsets, key=abs)), Parameter(group.names[0]).unit
     elif oriented and turn * problem.sigma_position > size * problem.sigma_orientation:
         size, unit = turn, 'rad'
-    weights, counts = (
-        np.concatenate([each[k] for k in group.sets]) for each in (scan.weights, scan.numbers)
-    )
+    weights = np.concatenate([scan.weights[k] for k in group.sets])
+    counts = np.concatenate([scan.numbers[k] for k in group.sets])
     later, near = counts >= place, range(place - LEAST_ASIDE + 1, place + LEAST_ASIDE)
     sides = (BEFORE_THAT, ~later), (FROM_THERE, later)
     most = fault_limit(problem) if unit == 'm' else problem.largest_angle

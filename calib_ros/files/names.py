@@ -219,14 +219,11 @@ def named_in(header: Sequence[str], joint: str) -> str:
 
 
 def numbers_in(header: Sequence[str], count: int) -> list[str]:
-    """Return the numbers `#k` of columns that a header calls by values, as a row without one.
-
-    Whole numbers before `count` others may count the rows; a row of a program has brackets.
-    """
+    """Return the numbers `#k` of columns called by values, or those of `count` decimal ones."""
     whole = [k for k, name in enumerate(header, 1) if re.fullmatch(r'-?[\d.,]+(e[+-]?\d+)?', name)]
-    values = [k for k in whole if re.search('[.,]', header[k - 1])]
+    values = [k for k in whole if re.search('[.,]', header[k - 1])]  # 1 may count rows
     if re.search(r'[={\[(]', ''.join(header)) or not (len(whole) == len(header) or values[1:]):
-        return []
+        return []  # not from a program
     return [f'#{k}' for k in (values if len(values) == count else whole)]
 
 
