@@ -219,12 +219,12 @@ def named_in(header: Sequence[str], joint: str) -> str:
 
 
 def numbers_in(header: Sequence[str], count: int) -> list[str]:
-    """Return the numbers `#k` of columns called by values, or those of `count` decimal ones."""
+    """Return the numbers `#k` of columns called by values; of `count` and a whole one, these."""
     whole = [k for k, name in enumerate(header, 1) if re.fullmatch(r'-?[\d.,]+(e[+-]?\d+)?', name)]
     values = [k for k in whole if re.search('[.,]', header[k - 1])]  # 1 may count rows
     if re.search(r'[={\[(]', ''.join(header)) or not (len(whole) == len(header) or values[1:]):
         return []  # not from a program
-    return [f'#{k}' for k in (values if len(values) == count else whole)]
+    return [f'#{k}' for k in (values if len(values) == count == len(whole) - 1 else whole)]
 
 
 def _no_joint(name: str) -> bool:
