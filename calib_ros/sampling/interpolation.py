@@ -17,7 +17,7 @@ def interpolated(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return values, velocities and accelerations (N, n) of the cubic through four samples.
 
-    Two before and two after the stamp (Lagrange). At the ends of the recording and beside equal
+    Two before and two after the stamp. At the ends of the recording and beside equal
     stamps, or always if `straight`, values are interpolated linearly.
     """
     known, values = rows.stamps, rows.values
@@ -39,24 +39,13 @@ def interpolated(
     inner[inner] = even
     near, times = near[:, even], times[:, even]
     heights = unwrapped(values[near] - origin[inner], revolute)  # (4, N, n)
-    at, slope, bend = _lagrange(times)
-    joints[inner] = origin[inner] + np.einsum('kn,knj->nj', at, heights)
-    velocity[inner] = np.einsum('kn,knj->nj', slope, heights)
+    powers = times.T[..., np.newaxis] ** np.arange(4)
+    at, slope, bend, _ = np.linalg.solve(powers, heights.swapaxes(0, 1)).swapaxes(0, 1)
+    joints[inner] = origin[inner] + at
+    velocity[inner] = slope
     acceleration = nothing.copy()
-    acceleration[inner] = np.einsum('kn,knj->nj', bend, heights)
+    acceleration[inner] = 2.0 * bend
     return joints, velocity, acceleration
-
-
-def _lagrange(times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the weights (4, N) of four values for value, slope and bend at time zero."""
-    at, slope, bend = (np.empty_like(times) for _ in range(3))
-    for k in range(4):
-        a, b, c = (times[i] for i in range(4) if i != k)
-        below = (times[k] - a) * (times[k] - b) * (times[k] - c)
-        at[k] = -a * b * c / below
-        slope[k] = (a * b + b * c + c * a) / below
-        bend[k] = -2.0 * (a + b + c) / below
-    return at, slope, bend
 
 
 def unwrapped(steps: FloatArray, revolute: Flags) -> FloatArray:
@@ -67,8 +56,7 @@ def unwrapped(steps: FloatArray, revolute: Flags) -> FloatArray:
 
 def continuous(values: FloatArray, revolute: Flags) -> FloatArray:
     """Return successive joint values (M, n) without jumps of a turn."""
-    steps = unwrapped(np.diff(values, axis=0), revolute)
-    return np.asarray(values[:1] + np.cumsum(np.vstack([0.0 * values[:1], steps]), axis=0))
+    return np.where(revolute, np.unwrap(values, axis=0), values)
 
 
 def last_moves(
