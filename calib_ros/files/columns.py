@@ -111,16 +111,12 @@ class Columns:
     ) -> FloatArray:
         """Return numbers (N, len(names)); a row has all of them or, if not `needed`, none."""
         found = self.numbers(names)
-        highest = max(found.max(initial=0.0), -found.min(initial=0.0))
-        if np.isnan(highest):
-            blank = np.isnan(found)
-            lacking = blank.any(axis=1) & (needed | ~blank.all(axis=1))
-            for row in np.flatnonzero(lacking)[:1].tolist():
-                name = names[int(blank[row].argmax())]
-                raise self._no_number(row, name, name)
-            highest = np.nanmax(np.abs(found), initial=0.0)
-        if highest > largest:
-            row, k = np.argwhere(np.abs(found) > largest)[0].tolist()
+        blank = np.isnan(found)
+        lacking = blank.any(axis=1) & (needed | ~blank.all(axis=1))
+        for row in np.flatnonzero(lacking)[:1].tolist():
+            name = names[int(blank[row].argmax())]
+            raise self._no_number(row, name, name)
+        for row, k in np.argwhere(np.abs(found) > largest)[:1].tolist():
             parse_number(float(found[row, k]), self.where(row, names[k]), InputError, largest)
         return found
 
