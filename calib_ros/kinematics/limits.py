@@ -23,12 +23,9 @@ def limits(chain: Chain) -> tuple[FloatArray, FloatArray]:
     Values of joints that only couplings move count for nothing, so these have none.
     """
     ends = [(joint.lower, joint.upper) for joint in chain.joints]
-    free = coupled(chain)
-    ends = [(None, None) if k in free else end for k, end in enumerate(ends)]
-    return (
-        np.array([-np.inf if lower is None else lower for lower, _ in ends]),
-        np.array([np.inf if upper is None else upper for _, upper in ends]),
-    )
+    lower, upper = np.array(ends, dtype=np.float64).T  # NaN for None
+    lower[[*coupled(chain)]] = upper[[*coupled(chain)]] = np.nan
+    return np.where(np.isnan(lower), -np.inf, lower), np.where(np.isnan(upper), np.inf, upper)
 
 
 def beyond(values: FloatArray, chain: Chain) -> Flags:
