@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
+from types import SimpleNamespace
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
@@ -42,6 +43,8 @@ TRANSIENT_LOCAL, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.V
 QUEUE, IMAGE_QUEUE = 5 * BATCH // 2, BATCH // 100
 """Messages and images of a topic that may wait while the node is busy: for seconds, on a busy
 machine. From a deeper queue Fast DDS drops the newest messages beyond 5,000, and reports none."""
+DUE = SimpleNamespace(add_event=lambda event: 0, is_ready=lambda kind, number: True)
+"""The wait set of one polled event, which is looked at."""
 
 
 @dataclass
@@ -109,17 +112,6 @@ class TopicState:
         return time.monotonic() - self.last > SILENCE
 
 
-class _Due:
-    """The wait set of one polled event."""
-
-    def add_event(self, event: object) -> int:
-        return 0
-
-    def is_ready(self, kind: str, number: int) -> bool:
-        """Return True, so that it is looked at."""
-        return True
-
-
 class Inputs:
     """Subscriptions to streams of messages, emptied by hand."""
 
@@ -153,8 +145,8 @@ class Inputs:
         """Note losses, silence, rates and failures since the last look."""
         self._subscribe_to_latched()
         for event, known in self._events.items():
-            event.add_to_wait_set(_Due())
-            event.is_ready(_Due())
+            event.add_to_wait_set(DUE)
+            event.is_ready(DUE)
             status = event.take_data()
             if status is not None and status.total_count != known:
                 self._events[event] = status.total_count
