@@ -84,8 +84,7 @@ def filled(template: str, **values: Any) -> str | None:
     except ImportError:
         return None
     values |= {'marks': MARKS, 'css': _template('report.css'), 'js': _template('report.js')}
-    page: str = _environment(jinja2).get_template(template).render(**values)
-    return page
+    return str(_environment(jinja2).get_template(template).render(**values))
 
 
 @cache  # pages of a fleet compile their template once

@@ -123,8 +123,7 @@ def rviz_config(text: str, namespace: str, fixed_frame: str = '') -> str:
                 display[key]['Value'] = above + display[key]['Value']
     if fixed_frame:
         manager['Global Options']['Fixed Frame'] = fixed_frame
-    edited: str = yaml.safe_dump(document, sort_keys=False)
-    return edited
+    return str(yaml.safe_dump(document, sort_keys=False))
 
 
 def _as_yaml(parameter: NodeParameter, text: str) -> str:
