@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Layouts of serialised messages: where their strings and numbers are.
-
-The names, or at least their lengths, and so the offsets of the numbers, mostly stay the same.
-"""
+"""Layouts of serialised messages: where their strings and numbers are."""
 
 from __future__ import annotations
 
