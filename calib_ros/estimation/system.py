@@ -31,9 +31,7 @@ class Prior:
 
     def rows(self, chain: Chain, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         """Return noise / sigma (P,), zero without a prior, and the weighted residual (P,)."""
-        inverse = np.array(
-            [self.noise / self.sigmas[n] if n in self.sigmas else 0.0 for n in names]
-        )
+        inverse = np.array([self.noise / self.sigmas.get(n, np.inf) for n in names])
         offsets = np.array(
             [chain.offset(n, self.nominal) if n in self.sigmas else 0.0 for n in names]
         )
