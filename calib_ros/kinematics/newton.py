@@ -90,7 +90,10 @@ def minimise_batch(
 
 
 def solve_positive(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve positive definite systems (n, n, B) for right hand sides (n, B), by elimination."""
+    """Solve positive definite systems (n, n, B) for right hand sides (n, B), by elimination.
+
+    One that is singular by rounding has no finite solution; LAPACK would refuse all of them.
+    """
     rows, x = matrix.copy(), right.copy()
     for k in range(len(x) - 1):
         factor = rows[k + 1 :, k] / rows[k, k]

@@ -83,3 +83,7 @@ def test_systems_are_solved_as_one_by_one(rng):
     right = rng.normal(size=(5, 7))
     wanted = [np.linalg.solve(matrix[..., k], right[:, k]) for k in range(7)]
     np.testing.assert_allclose(solve_positive(matrix, right), np.transpose(wanted), rtol=1e-6)
+    matrix[..., 3] = 4.0
+    with np.errstate(divide='ignore', invalid='ignore'):
+        found = solve_positive(matrix, right)
+    assert np.isfinite(found).all(axis=0).tolist() == [k != 3 for k in range(7)]
