@@ -55,13 +55,13 @@ def cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Comparison
 
 def _with_usual_priors(fitted: Fitted) -> System:
     """Return the system with priors, because some stations may not determine the fit."""
-    problem, weights = fitted.problem, [each.weights for each in fitted.system.sets]
+    problem = fitted.problem
     if problem.learned is None:
         found = Inference(fitted, fitted.size).likeliest().priors
         arm = (n for n in fitted.names if not problem.model.owns_frame(n))
         priors = {n: min(found[n], problem.common_sense(n)) for n in arm}
         problem = replace(problem, learned=Learned(priors, fitted.size))
-    return problem.system(problem.sets).weighted(weights)
+    return replace(fitted.system, prior=problem.system(()).prior)
 
 
 def fold_residuals(
