@@ -15,7 +15,7 @@ from calib_ros.errors import ColumnsError, InputError
 from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, layout_of
-from calib_ros.files.names import turns_in
+from calib_ros.files.names import matrix_in, turns_in
 from calib_ros.files.vocabulary import TURNS
 from calib_ros.kinematics.chain import Joint
 
@@ -257,6 +257,9 @@ def test_a_homogeneous_matrix_is_proposed(tmp_path, form, first):
     given = ['theta_1', 'theta_2', *nominal, *(form.format(*each) for each in places)]
     path.write_text(text_of(JOINTS, numbers + 0.1, numbers, names=given, separator=';'))
     assert_same(proposed(path))
+    measured = [form.format(*each) for each in places]
+    assert len(matrix_in(measured)) == 12
+    assert matrix_in([name for name in measured if name != measured[6]]) == {}
 
 
 @pytest.mark.parametrize(

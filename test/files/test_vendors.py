@@ -152,6 +152,25 @@ def test_arms_that_are_laid_out_otherwise_get_no_file():
         assert vendor_files(other, other) == ()
 
 
+BRACE = """<link name="brace"/>
+  <joint name="brace" type="fixed"><parent link="panda_link2"/><child link="brace"/></joint>
+  """
+
+
+@pytest.mark.parametrize(
+    ('given', 'other'),
+    [
+        ('<axis xyz="0.0 0.0 1.0"', '<axis xyz="0.0 0.0 -1.0"'),
+        ('panda_joint8', 'panda_end'),
+        ('<parent link="panda_link2"', '<parent link="brace"'),
+    ],
+)
+def test_urdfs_that_are_laid_out_otherwise_get_no_file(given, other):
+    text = PANDA.replace(given, other).replace('<joint', f'{BRACE}<joint', 'brace' in other)
+    arm = replace(chain_from_urdf(text, tip_link='panda_link8'), base=None, tool=None)
+    assert vendor_files(arm, arm, urdf=text, links={'tip_link': 'panda_link8'}) == ()
+
+
 def test_what_the_file_cannot_hold_is_said():
     nominal = load_chain('ur10e')
     chain = corrected(nominal).with_offsets({'wrist_3_joint.a': 1e-3})
