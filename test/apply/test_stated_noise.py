@@ -52,7 +52,7 @@ def test_a_device_with_more_noise_does_not_condemn_the_arm(cell, arm):
         assert (same.verdict, same.noise) == ('holds', 0.0)
 
 
-def test_a_stated_noise_may_have_the_value_of_the_default(cell, arm):
+def test_a_stated_noise_may_have_the_value_of_the_default(cell, arm, none_odd):
     """It was taken for that of the earlier device, here a better one."""
     noise, names = (Settings.sigma_position, 4e-4), ('sigma_position', 'sigma_orientation')
     seen = measured(cell[0], UR.random_joints(40, np.random.default_rng(3)), 1, noise)
@@ -101,7 +101,7 @@ def test_a_joint_that_slips_more_and_more_is_no_noise_of_the_device(cell, arm):
 
 
 @pytest.mark.parametrize('refitted', [False, True])
-def test_rows_in_another_order_are_no_noise_of_the_device(cell, arm, refitted):
+def test_rows_in_another_order_are_no_noise_of_the_device(cell, arm, refitted, unsearched):
     """Errors of 1 m were told as noise of the device, in 17 of 18 cases."""
     seen = measured(cell[0], UR.random_joints(20, np.random.default_rng(3)), 1)
     rows = replace(seen, positions=np.random.default_rng(0).permutation(seen.positions))
@@ -209,7 +209,7 @@ def test_nothing_measured_is_told(cell, arm):
         verify(arm, [none], None)
 
 
-def test_noise_that_is_stated_larger_than_all_errors_is_told(cell, arm):
+def test_noise_that_is_stated_larger_than_all_errors_is_told(cell, arm, none_odd):
     """~/check said that a slipped arm agrees."""
     slipped = cell[0].with_offsets({'elbow_joint.theta': 1.5e-3})
     seen = measured(slipped, UR.random_joints(30, np.random.default_rng(3)), 1)

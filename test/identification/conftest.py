@@ -14,11 +14,3 @@ def earlier():
     true = arm(4)
     text = Calibration.of(identify(problem(true, 60, 0))).dump()
     return true, parse_calibration(text, 'earlier.yaml', UR10E)
-
-
-@pytest.fixture
-def none_odd(monkeypatch):
-    """Let no single pose be left out, which takes longer than all else."""
-    from calib_ros.identification import recalibration
-
-    monkeypatch.setattr(recalibration, '_without_one', lambda *_: ())

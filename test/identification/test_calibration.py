@@ -201,8 +201,8 @@ def test_of_a_file_of_before_what_it_tells_is_known(found):
 def test_a_file_that_was_cut_off_is_refused(found):
     """Its region, and the nominal chain that it belongs to, would be lost without a word."""
     text = found.dump()
-    ends = [k for k, letter in enumerate(text) if letter in '\n:']
-    for end in ends[:-1]:
+    ends = re.finditer(r':|\n(?!\s+-?\d)', text.rstrip())  # those within a matrix are alike
+    for end in (each.start() for each in ends):
         with pytest.raises(ConfigError):
             parse_calibration(text[:end], 'c.yaml', UR)
     cut = text[: text.index('\n  covariance:') + 1]

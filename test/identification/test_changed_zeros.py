@@ -258,7 +258,7 @@ def test_another_target_of_a_scara_leaves_its_device_where_it_stands(seed, orien
 
 
 @pytest.mark.parametrize('earlier', [True], indirect=True)
-def test_a_slip_between_a_device_and_a_target_far_away_is_named_beside_both(earlier):
+def test_a_slip_between_a_device_and_a_target_far_away_is_named_beside_both(earlier, none_odd):
     """Another arm there asks for new frames: the remedy was to identify again."""
     true, previous, oriented = earlier
     rng = np.random.default_rng(1)

@@ -55,15 +55,12 @@ def test_a_calibration_simulated_without_noise_is_updated(earlier):
 
 
 def test_device_and_target_that_both_moved_far_are_named(earlier):
-    """They were refused; another robot there is still."""
+    """They were refused."""
     rng = np.random.default_rng(3)
     frames = {'base': random_frame(rng, 2.0), 'tool': random_frame(rng, 0.2)}
     found = recalibrate(earlier[0], seen(12, true=replace(TRUE, **frames), **SIGMAS), 0.1)
     assert found.accepted
     assert [reasons[0].owner for reasons in found.changed] == ['base', 'tool']
-    other = replace(faulty(UR10E, Cell(), np.random.default_rng(5)), **frames)
-    with suppress(InputError):
-        assert not recalibrate(earlier[0], seen(12, true=other, **SIGMAS), 0.1).accepted
 
 
 def test_a_device_that_moved_far_and_a_slipped_zero_are_named(earlier):

@@ -56,7 +56,7 @@ def test_distances_show_a_slipped_zero_of_a_wobbling_arm(earlier):
     assert {each.owner for reasons in found.changed for each in reasons} == {'elbow_joint'}
 
 
-def test_poses_of_another_robot_are_told():
+def test_poses_of_another_robot_are_told(none_odd):
     """Three links that seemed bent explained them: the calibration became that of the other."""
     true = arm(0, errors=0.2)
     previous = Calibration.of(identify(problem(true, 60, 0)))
@@ -337,7 +337,7 @@ def test_a_device_whose_place_was_given_may_be_moved(rng):
 
 
 @needs_data
-def test_poses_that_do_not_tell_of_new_frames_are_too_few():
+def test_poses_that_do_not_tell_of_new_frames_are_too_few(none_odd):
     """Eight poses of a UR10 on another day; the device stands elsewhere, the target is new.
 
     By what seven of them tell the eighth is 8 mm off, by the earlier arm in new frames 12 mm.

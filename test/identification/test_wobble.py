@@ -141,8 +141,8 @@ def test_expected_errors_contain_it_away_from_the_region():
         result = identify(arm.measured(middle, 60))
         found = Calibration.of(result)
         for q in (
-            middle + arm.rng.uniform(-WIDTH, WIDTH, (200, 6)),
-            UR10E.random_joints(1200, arm.rng),  # more than a block
+            middle + arm.rng.uniform(-WIDTH, WIDTH, (60, 6)),
+            UR10E.random_joints(200, arm.rng),
         ):
             error = (found.chain.forward(q) - arm.poses(q))[:, :3, 3]
             squares.append((np.mean((error**2).sum(axis=1)), np.mean(found.sigma(q) ** 2)))
@@ -150,6 +150,8 @@ def test_expected_errors_contain_it_away_from_the_region():
             np.testing.assert_allclose(found.sigma(q) ** 2, stated)
         certain = replace(found, unmodelled=NOTHING)
         assert np.mean(certain.sigma(q) ** 2) < 0.5 * np.mean(found.sigma(q) ** 2)
+    many = found.sigma(np.tile(q, (11, 1)))  # more than a block
+    np.testing.assert_allclose(many, np.tile(found.sigma(q), 11))
     near, far = np.sum(squares[::2], axis=0), np.sum(squares[1::2], axis=0)
     for actual, expected in (near, far):
         assert 0.6 < np.sqrt(actual / expected) < 1.1
