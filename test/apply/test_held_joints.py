@@ -55,7 +55,7 @@ def path():
 
 
 @pytest.mark.parametrize('wanted', [('--poses', 6), ('--iso9283',)])
-def test_a_joint_locked_off_zero_is_planned_where_it_is(run, tmp_path, wanted):
+def test_a_joint_locked_off_zero_is_planned_where_it_is(run, tmp_path, wanted, hurried):
     """It was refused, as if it had been measured at zero."""
     (tmp_path / 'locked.yaml').write_text(dump_chain(LOCKED))
     status, _, err = run('plan', '--chain', 'locked.yaml', *wanted, '--out', 'plan.csv')

@@ -16,7 +16,7 @@ from calib_ros.kinematics.se3 import invert
 
 
 @pytest.mark.parametrize(('name', 'seed'), [('denso_hsr065', 0), ('abb_irb120', 2)])
-def test_the_test_poses_are_those_of_the_standard(name, seed, rng):
+def test_the_test_poses_are_those_of_the_standard(name, seed, rng, hurried):
     chain = replace(load_chain(name), base=simulation.random_frame(rng, 2.0))
     design = design_of(chain)
     found = iso_9283_poses(design, np.random.default_rng(seed))
@@ -32,12 +32,12 @@ def test_the_test_poses_are_those_of_the_standard(name, seed, rng):
     assert ((limits[:, 0] <= found.joints) & (found.joints <= limits[:, 1])).all()
 
 
-def test_an_arm_that_cannot_keep_its_orientation_reaches_the_places(rng):
+def test_an_arm_that_cannot_keep_its_orientation_reaches_the_places(hurried):
     design = design_of(load_chain('kuka_youbot'))
-    found = iso_9283_poses(design, rng)
+    found = iso_9283_poses(design, np.random.default_rng(1))
     places = design.targets(found.joints)[:, :3, 3]
     assert not found.oriented
-    assert found.edge > 0.1
+    assert 2.0 * np.abs(places[0, :2]).max() > found.edge > 0.1  # beside the arm
     np.testing.assert_allclose(np.abs(places[1:] - places[0]), 0.4 * found.edge, atol=1e-6)
 
 

@@ -229,7 +229,7 @@ def test_units_are_named_though_a_common_motion_would_take_most_of_the_error(arm
 
 
 @pytest.mark.parametrize(('known', 'told'), [(-0.04, False), (0.0, True)])
-def test_an_arm_that_is_far_off_by_itself_has_no_wrong_units(arm, known, told):
+def test_an_arm_that_is_far_off_by_itself_has_no_wrong_units(arm, known, told, unsearched):
     """A robot 28 mm off, 17 mm with zeros set anew, was told that no arm is that far off."""
     far = replace(arm, before=arm.chain.with_offsets({'elbow_joint.theta': known}))
     moved = arm.chain.with_offsets({'elbow_joint.theta': 0.04})

@@ -134,7 +134,7 @@ def test_a_program_that_runs_in_a_loop_is_judged_as_one_lap():
 
 def test_what_another_robot_leaves_is_never_accepted():
     """An arm of another kind with the same number of joints, which fits by chance."""
-    *_, seen = measured_arm(16, 60, chain=load_chain('franka_panda'))
+    *_, seen = measured_arm(16, 40, chain=load_chain('franka_panda'))
     assert not identify(Problem(load_chain('kuka_iiwa14'), seen)).accepted
 
 

@@ -303,7 +303,7 @@ def corners_to(folder, name):
 
 @needs_data
 @pytest.mark.parametrize(('lens', 'least', 'limit'), [('given', 2.4, 2.66), ('fitted', 0.5, 1.10)])
-def test_the_real_photographs(photographs, capsys, lens, least, limit):
+def test_the_real_photographs(photographs, capsys, lens, least, limit, single):
     words = ['identify', '--chain', 'flange_pose', '--json', '--lens', lens]
     for name, file in (('detections', 'corners.csv'), ('board', 'board.yaml')):
         words += [f'--{name}', str(photographs / file)]

@@ -99,7 +99,7 @@ def renamed(tracked, frames):
 
 def test_measurements_with_and_without_a_frame_are_told():
     made = CalibrationSession(UR5E)
-    drive(made, 16, [renamed(tracker(), dict.fromkeys(range(0, 10**4, 2), ''))])
+    drive(made, 6, [renamed(tracker(), dict.fromkeys(range(0, 10**4, 2), ''))])
     with pytest.raises(InputError, match=r'different frames \(one without name, tracker\)'):
         made.problem()
 
@@ -107,10 +107,10 @@ def test_measurements_with_and_without_a_frame_are_told():
 def test_a_leading_slash_makes_no_other_frame():
     """As older programs write it; tf and RViz refuse it."""
     made = CalibrationSession(UR5E, Settings(frame_id='/tracker'))
-    drive(made, 16, [renamed(tracker(), dict.fromkeys(range(0, 10**4, 2), '/tracker'))])
+    drive(made, 5, [renamed(tracker(), dict.fromkeys(range(0, 10**4, 2), '/tracker'))])
     made.finish()
     assert made.problem().world_frame == 'tracker'
-    assert len(made.samples) == 16
+    assert len(made.samples) == 5
 
 
 def test_a_frame_id_that_was_set_right_is_no_longer_told_as_wrong():
@@ -126,11 +126,9 @@ def test_a_frame_id_that_was_set_right_is_no_longer_told_as_wrong():
 @pytest.mark.parametrize('where', [0, 100])
 def test_a_stray_frame_is_counted_and_the_others_are_identified(where):
     """Also of the first measurement, which would make a sample of its own."""
-    made, expected = CalibrationSession(UR5E), CalibrationSession(UR5E)
+    made = CalibrationSession(UR5E)
     drive(made, 16, [renamed(tracker(), {where: 'stray'})])
-    drive(expected, 16, [tracker()])
     made.finish()
-    expected.finish()
     if where:  # the first comes in the time in which the arm has just stopped
         dropped = made.account().dropped
         assert dropped['measurements: in frame "stray", not in "tracker" like the others'] == 1
@@ -138,7 +136,7 @@ def test_a_stray_frame_is_counted_and_the_others_are_identified(where):
     assert made.identify().accepted
     assert made.problem().world_frame == 'tracker'
     assert {sample.frame_id for sample in made.samples} == {'tracker'}
-    assert len(made.samples) == len(expected.samples)
+    assert len(made.samples) == 16
 
 
 def test_a_sample_in_a_stray_frame_is_left_out_when_the_usual_one_is_known():
@@ -158,7 +156,7 @@ def test_a_sample_in_a_stray_frame_is_left_out_when_the_usual_one_is_known():
 def test_a_device_that_renames_its_frame_is_told(first):
     """As a driver once it has started: the few poses before that were identified unasked."""
     made = CalibrationSession(UR5E)
-    drive(made, 16, [renamed(tracker(), dict.fromkeys(range(NO_ACCIDENT), first))])
+    drive(made, 6, [renamed(tracker(), dict.fromkeys(range(NO_ACCIDENT), first))])
     dropped = made.account().dropped
     cause = f'measurements: in frame "tracker", not in "{first}" like the others'
     assert dropped[cause] > made.account().poses // 2
@@ -295,8 +293,8 @@ def test_samples_of_another_robot_are_not_restored():
 
 
 def test_clear_forgets_samples_and_counts_but_not_the_calibration():
-    made = session()
-    drive(made, 30, [tracker()])
+    made = session(samples())
+    drive(made, 2, [tracker()])
     made.finish()
     result = made.identify()
     assert result.accepted
