@@ -25,14 +25,14 @@ def measured(chain=TRUE, count=TRAIN + TEST, seed=5, oriented=True):
 
 
 def rows_of(observations, held_out=TEST):
-    rows = []
+    rows, oriented = [], observations.oriented.all()
+    quats = to_quat(observations.rotations).tolist() if oriented else []
     for k in range(len(observations)):
         row = {'split': 'test' if k >= len(observations) - held_out else 'train'}
         row |= {f'q{i + 1}': value for i, value in enumerate(observations.joints[k].tolist())}
         row |= dict(zip('xyz', observations.positions[k].tolist(), strict=True))
-        if observations.oriented.all():
-            quat = to_quat(observations.rotations[k]).tolist()
-            row |= dict(zip(('qx', 'qy', 'qz', 'qw'), quat, strict=True))
+        if oriented:
+            row |= dict(zip(('qx', 'qy', 'qz', 'qw'), quats[k], strict=True))
         rows.append(row)
     return rows
 

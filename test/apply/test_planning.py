@@ -147,6 +147,12 @@ def test_wrong_arguments_are_refused():
             planning.plan(design, q, q, 5, chosen=chosen)
 
 
+@pytest.fixture
+def unmoved(unsearched, monkeypatch):
+    """Let neither mistakes nor moves be looked for, which takes most of the time."""
+    monkeypatch.setattr('calib_ros.identification.identification.find_step', lambda *_: None)
+
+
 def measured_problem(name, session):
     chain = load_chain(DATA / name / 'chain.yaml')
     table = read_table(DATA / name / 'uniform.csv', len(chain.joints), (session,))
@@ -154,7 +160,7 @@ def measured_problem(name, session):
 
 
 @needs_data
-def test_half_of_the_measured_poses_predict_as_well_as_all():
+def test_half_of_the_measured_poses_predict_as_well_as_all(unmoved):
     """Chosen without what was measured there; and the noise found is what is left on others."""
     problem = measured_problem('fr3_camera_eyeinhand', 'all')
     fitted = problem.observations
@@ -172,7 +178,9 @@ def test_half_of_the_measured_poses_predict_as_well_as_all():
     ('name', 'session', 'least'),
     [('wam7_jacobi_lasertracker', 'grid', 0.8), ('positioner_2axis_pose', 'all', 0.45)],
 )
-def test_errors_away_from_the_fitted_poses_are_of_the_size_predicted(name, session, least):
+def test_errors_away_from_the_fitted_poses_are_of_the_size_predicted(
+    unmoved, name, session, least
+):
     """Over the outer fifths of a joint's values, each left out: not by much more than that.
 
     By less on the positioner: errors that neighbours share count against the parameters as a whole

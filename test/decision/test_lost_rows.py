@@ -114,8 +114,6 @@ def test_rows_that_fit_are_in_no_other_order_nor_are_those_of_messages():
     assert orders.other_order(Problem(UR10E, seen), UR10E, seen, 5e-3) is None
     swept = seen.select(np.argsort(seen.joints[:, 2]))
     assert orders.other_order(Problem(UR10E, swept), UR10E, swept, 1e-6) is None  # a worse arm
-    mixed = replace(seen, joints=seen.joints[np.random.default_rng(1).permutation(40)])
-    assert diagnose(Problem(UR10E, mixed)) is None
     back = replace(seen, joints=seen.joints[::-1])
     assert orders.other_order(Problem(UR10E, back), UR10E, back, 5e-3)
     messages = Problem(UR10E, back, of_messages=True)

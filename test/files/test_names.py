@@ -81,30 +81,33 @@ def proposed(path, said='.*'):
     raise AssertionError(given)
 
 
+PAIRS = [
+    ('{}_nom', '{}_meas'),
+    ('Nominal {}', 'Actual {}'),
+    ('{} Soll', '{} Ist'),
+    ('{} Nom', '{} Act'),
+    ('{} (nominal)', '{} (measured)'),
+    ('tcp.{}', 'leica.point.{}'),
+    ('{}', '{}_meas'),
+    ('{}', 'Actual {}'),
+    ('{}', 'Tracker {}'),
+    ('{} théorique', '{} mesuré'),
+    ('{} nominale', '{} misurata'),
+    ('{} teórico', '{} medido'),
+    ('{}', '{}_true'),
+    ('{}_corr', '{}_true'),
+    ('{}', '{}meas'),
+    ('{}', '{}M'),
+    ('{}', '{}測定値'),
+    ('{}nom', '{}act'),
+]
+JOINT_NAMES = (['q1', 'q2'], ['J1', 'J2'])
+
+
 @pytest.mark.parametrize(
-    ('first', 'second'),
-    [
-        ('{}_nom', '{}_meas'),
-        ('Nominal {}', 'Actual {}'),
-        ('{} Soll', '{} Ist'),
-        ('{} Nom', '{} Act'),
-        ('{} (nominal)', '{} (measured)'),
-        ('tcp.{}', 'leica.point.{}'),
-        ('{}', '{}_meas'),
-        ('{}', 'Actual {}'),
-        ('{}', 'Tracker {}'),
-        ('{} théorique', '{} mesuré'),
-        ('{} nominale', '{} misurata'),
-        ('{} teórico', '{} medido'),
-        ('{}', '{}_true'),
-        ('{}_corr', '{}_true'),
-        ('{}', '{}meas'),
-        ('{}', '{}M'),
-        ('{}', '{}測定値'),
-        ('{}nom', '{}act'),
-    ],
+    ('first', 'second', 'joints'),
+    [(*pair, JOINT_NAMES[k % 2]) for k, pair in enumerate(PAIRS)],
 )
-@pytest.mark.parametrize('joints', [['q1', 'q2'], ['J1', 'J2']])
 def test_nominal_coordinates_are_never_taken_for_measured_ones(path, first, second, joints):
     """Plain names beside measured ones were, without a word."""
     header = [*joints, *names(first), *names(second)]
