@@ -16,7 +16,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, sections
 from calib_ros.report.content import Headline, Origin, Report, Section
 from calib_ros.report.poses import unit_of
-from calib_ros.shown import rounded, sentence
+from calib_ros.shown import counted, rounded, sentence
 
 VISIT = 'visit P1 to P5 in turn, 30 times, and measure each time'
 
@@ -130,7 +130,7 @@ def outlook(plan: Plan, candidates: int, wanted_mm: float | None, needed: int | 
         text += f', at least {100.0 * plan.efficiency:.0f} % as good as the best choice'
     lines = [f'{text}; moves take {plan.travel:.0f} s']
     if needed is not None:
-        lines.append(f'{needed} poses reach {wanted_mm:g} mm')
+        lines.append(f'{counted(needed, "pose")} will reach {wanted_mm:g} mm')
     if plan.lacking:
         lines.append(
             f'no choice of these candidates determines {", ".join(plan.lacking)}: move the joints '

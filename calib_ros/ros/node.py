@@ -57,7 +57,7 @@ from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.source_texts import parse_sources
 from calib_ros.sampling.sources import STANDARD
 from calib_ros.sampling.streams import Stream, source_streams
-from calib_ros.shown import rounded
+from calib_ros.shown import counted, rounded
 
 DIAGNOSTICS_PERIOD = 1.0  # time [s] between two reports on /diagnostics, the usual one
 TAKING_PERIOD = DIAGNOSTICS_PERIOD / 10.0
@@ -320,7 +320,7 @@ class CalibrationNode(Batched):
         count = len(self.session.samples)
         old = self._archive.start_new()
         self.session.clear()
-        told = f'{count} poses cleared' + (f'; they remain in {old}' if old and count else '')
+        told = counted(count, 'pose') + ' cleared' + (f'; they remain in {old}' if old and count else '')
         return True, told + '; the calibration stays' * (self.session.calibration is not None)
 
     def _on_record(self, request: Any) -> Answer:

@@ -142,10 +142,10 @@ def test_plan_says_how_many_poses_a_wanted_error_needs(run, tmp_path):
     given = ('plan', '--chain', 'ur10e', '--accuracy', 0.1, '--draw', 200)
     _, out, _ = run(*given, '--out', 'plan.csv')
     count = len(read_joints(tmp_path / 'plan.csv', load_chain('ur10e')))
-    assert f'{count} poses reach 0.1 mm' in out
+    assert f'{count} poses will reach 0.1 mm' in out
     assert 18 <= count <= 26
     _, out, _ = run(*given, '--poses', 10)
-    assert f'{count} poses reach 0.1 mm' in out
+    assert f'{count} poses will reach 0.1 mm' in out
     assert out.splitlines()[-6].split()[0] == '10'
 
 
