@@ -122,6 +122,7 @@ class Calibration(Shown):
             'not_identifiable': list(result.unidentifiable),
             **about(result.chain, result.before, region),
             'frames': records.owners_document(owners),
+            'outdated': [*result.step.owners] if result.step and result.step.outdated else [],
             **(origin or {}),
         }
         return cls(
@@ -150,10 +151,8 @@ class Calibration(Shown):
                 'root': packed(self.covariance),
             }
             if self.unmodelled.names:
-                record['covariance']['unmodelled'] = {
-                    **self.unmodelled.sizes,
-                    'followed': rows_of(self.unmodelled.followed),
-                }
+                followed = {'followed': rows_of(self.unmodelled.followed)}
+                record['covariance']['unmodelled'] = self.unmodelled.sizes | followed
         if self.rows is not None:
             record['rows'] = self.rows.document()
         return HEAD + dump_chain(self.chain, record)
@@ -176,7 +175,13 @@ class Calibration(Shown):
         """Return the robot and the date of the calibration, as far as known."""
         made, serial = (str(self.record.get(key) or '') for key in ('created', 'robot_serial'))
         robot = f'{self.chain.name} {serial or "(no serial)"}'
-        return f'the calibration of {robot}' + f', made {made[:10]}' * bool(made)
+        moved = f'; {", ".join(self.outdated)} moved since: measure again' * bool(self.outdated)
+        return f'the calibration of {robot}' + f', made {made[:10]}' * bool(made) + moved
+
+    @property
+    def outdated(self) -> tuple[str, ...]:
+        """Return the frames that moved during the session: they are those of before."""
+        return records.outdated(self.record)
 
     def removed(self, joints: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the correction at joint values (N, n): distance (N,) [m] and angle (N,) [rad]."""
@@ -268,13 +273,13 @@ class Calibration(Shown):
         joints = np.concatenate([each.joints for each in sets])
         return 1.0 - float(np.mean(self.region.covers(joints)))
 
-    def step(self, sets: Sequence[Observations]) -> Step | None:
+    def step(self, sets: Sequence[Observations], of_messages: bool = False) -> Step | None:
         """Return what moved while new measurements were taken, if that explains most errors."""
-        chain = self.chain
+        chain = reframed(self.chain, self.chain.frame_names, fixed=False)
         arm = tuple(name for name in chain.parameter_names if not chain.owns_frame(name))
-        chain = reframed(chain, chain.frame_names, fixed=False)
         try:
-            fitted = fit(Problem(chain, sets[0], more=tuple(sets[1:]), fixed=arm))
+            problem = Problem(chain, sets[0], more=sets[1:], fixed=arm, of_messages=of_messages)
+            fitted = fit(problem)
         except InputError:  # too few for frames of their own
             return None
         found = find_step(fitted)

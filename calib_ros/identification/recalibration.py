@@ -102,7 +102,7 @@ def recalibrate(
     if not found.explained:
         if mistake := mistakes.diagnose_alone(problem, arm):
             raise InputError(f'the new poses do not fit the arm: {mistake}')
-        return replace(found, step=previous.step(problem.all_sets))
+        return replace(found, step=previous.step(problem.all_sets, problem.of_messages))
     return found
 
 
@@ -363,14 +363,13 @@ def _updated(
     arm: _Arm, found: _Found, problem: Problem, changed: Sequence[Sequence[Explanation]]
 ) -> Calibration:
     previous, chain = arm.previous, arm.changed(found.change, found.covariance)
-    before = previous.before
+    own, region, before = arm.own, previous.region, previous.before
     for name in before.frame_names:
         old, new, current = (each.frame(name) for each in (previous.chain, chain, before))
         moved = new.matrix @ invert(old.matrix) @ current.matrix
         if name.startswith('tool'):
             moved = current.matrix @ invert(old.matrix) @ new.matrix
         before = before.with_frame(name, replace(current, matrix=moved))
-    own, region = arm.own, previous.region
     left = found.change - arm.applied(found.change, found.covariance)
     square = found.covariance + np.outer(left, left)
     names = tuple(arm.names[k] for k in own)
@@ -385,6 +384,7 @@ def _updated(
         'previous': {key: previous.record.get(key) for key in ('created', 'table_sha256')},
         'measured': recorded_time(problem.all_sets),
         'new_samples': sum(map(len, problem.all_sets)),
+        'outdated': sorted({*previous.outdated} - {*frames_of_sets(problem.all_sets, True, True)}),
         'changed': [changes.reason_in_words(each) for each in changed],
     }
     return replace(

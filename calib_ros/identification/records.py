@@ -50,6 +50,12 @@ def owners_document(owners: Mapping[str, Owner]) -> dict[str, Any]:
     return {name: dict(zip(OWNER, owner, strict=True)) for name, owner in owners.items()}
 
 
+def outdated(record: Mapping[str, Any], where: str = '') -> tuple[str, ...]:
+    """Return the frames that moved while they were measured; `where` begins its errors."""
+    found: tuple[str, ...] = parse_like((), record.get('outdated', ()), f'{where}outdated')
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class Record:
     """The record of a calibration; `where` names it in errors."""
@@ -88,6 +94,7 @@ class Record:
             )
         if not isinstance(frame, str):
             raise ConfigError(f'{where}: calibration.world_frame must be text, not {frame!r:.100}')
+        outdated(record, f'{where}: calibration.')
         return cls(record, where)
 
     def _part(self, key: str) -> dict[str, Any]:

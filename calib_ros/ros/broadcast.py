@@ -4,15 +4,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 
 from calib_ros.errors import ConfigError
+from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.ros import to_ros
@@ -48,15 +46,12 @@ class Broadcast:
             self._base = described.frame('base').matrix
             self._tool = described.frame('tool').matrix
 
-    def publish(
-        self, chain: Chain, world: str, in_hand: bool, outdated: Collection[str] = ()
-    ) -> None:
-        """Publish the frames of a calibrated chain measured in the frame `world`.
-
-        Those `outdated` have moved since, and are left out.
-        """
+    def publish(self, calibration: Calibration) -> None:
+        """Publish the frames of a calibration; those outdated are left out."""
         if self._publisher is None:
             return
+        chain, world = calibration.chain, calibration.world_frame
+        in_hand = to_ros.in_hand(calibration.owners)
         base, flange, target = self._names
         stands, moves = (target, world) if in_hand else (world, target)
         found = {
@@ -70,7 +65,8 @@ class Broadcast:
                 f'the measurements come in frame "{world}": /tf_static lacks it; give it a name '
                 'other than base_frame, flange_frame and target_frame'
             )
-        kept = [each for frame, each in found.items() if frame not in outdated and all(each[:2])]
+        known = {frame: each for frame, each in found.items() if frame not in calibration.outdated}
+        kept = [each for each in known.values() if all(each[:2])]
         transforms = [self._transform(*each) for each in kept]
         self._publisher.publish(self._type(transforms=transforms))
 

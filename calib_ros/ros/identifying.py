@@ -229,8 +229,7 @@ class Identifying:
         page = partial(_page, given, result)
         if result.accepted:
             found = Calibration.of(result, given.origin, loaded.owners, loaded.problem.sets)
-            outdated = result.step.owners if result.step and result.step.outdated else ()
-            published = Published(found.dump(), given.configuration, page, outdated)
+            published = Published(found.dump(), given.configuration, page)
             self._accepted(found, published, given.samples)
             self.earlier = ''
             self.last += f'; {nearer}' * bool(nearer) + KEEP

@@ -40,13 +40,12 @@ class Published(NamedTuple):
     """A calibration as the text of a file, with its settings, if known.
 
     `page` makes the report of its identification, which takes a while; it returns None if that is
-    not possible. The frames `outdated` moved meanwhile.
+    not possible.
     """
 
     text: str
     configuration: str
     page: Callable[[], str | None] = lambda: None
-    outdated: tuple[str, ...] = ()
 
 
 class Keeper:
@@ -89,9 +88,7 @@ class Keeper:
             self._published, self.unsaved = published, samples is not None
             self._dh_parameters.publish(to_ros.dh_parameters(calibration.chain))
             self._calibration.publish(String(data=published.text))
-            seen = to_ros.in_hand(calibration.owners)
-            where = calibration.world_frame, seen, published.outdated
-            self._broadcast.publish(calibration.chain, *where)
+            self._broadcast.publish(calibration)
         self._adopted(calibration, self._world(calibration))
 
     def save(self) -> Job:
@@ -168,6 +165,8 @@ class Keeper:
         """Publish the corrected pose of the latest joint values, once."""
         calibration, latest = self._session.calibration, self._session.latest
         if calibration is None or latest is None or latest is self._posed:
+            return
+        if {'base', 'tool'} & {*calibration.outdated}:
             return
         self._posed = latest
         stamp_ns, values = latest

@@ -302,6 +302,7 @@ GOOD = {'nominal': nominal_document(UR), 'rms_mm_after': 0.1, 'world_frame': 'tr
                 'accepted': ('no', 0, None),
                 'rms_mm_after': (float('nan'), float('inf'), 'small', -0.1),
                 'world_frame': (5, None),
+                'outdated': (5, None, [1]),
             }.items()
             for value in values
         ),

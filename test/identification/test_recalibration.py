@@ -30,9 +30,11 @@ def but(seen, **changed):
 @pytest.mark.parametrize('joint', ['elbow_joint', 'wrist_2_joint'])
 def test_a_joint_whose_zero_has_slipped_is_named_and_mended_by_8_poses(earlier, joint):
     true, previous = earlier
+    previous = replace(previous, record={**previous.record, 'outdated': ['tool', 'tool_ball']})
     now = true.with_offsets({f'{joint}.theta': 5e-4})
     found = recalibrate(previous, problem(now, 8, 1), 0.1)
     assert found.accepted
+    assert found.calibration.outdated == ('tool_ball',)  # which was not measured again
     ((reason, *others),) = found.changed
     assert {each.owner for each in (reason, *others)} == {joint}
     assert reason.change[0] == pytest.approx(5e-4, abs=4.0 * reason.sigma[0])
@@ -301,10 +303,13 @@ def test_what_moves_while_new_poses_are_measured_is_named(earlier, none_odd):
     first, then = (problem(arm, 16, 1).observations for arm in (true, now))
     positions = np.concatenate([first.positions[:9], then.positions[9:]])
     mixed = replace(first, positions=positions, oriented=np.zeros(16, dtype=bool))
-    found = recalibrate(previous, Problem(UR10E, mixed, **SIGMAS), 0.1)
+    seen = Problem(UR10E, mixed, **SIGMAS)
+    found = recalibrate(previous, seen, 0.1)
     assert not found.accepted
     why, what = found.refusal()
     assert 'the zero of elbow_joint moved by 0.95 mrad before line 10' in why
+    again = recalibrate(previous, replace(seen, of_messages=True), 0.1)  # by ~/check
+    assert again.step.where == 'the pose of 10.000 s'
     assert what == 'measure again, or give only the poses from there on'
     held = replace(previous.chain.base, fixed=True)  # where the device does not stand any more
     there = replace(previous, chain=replace(previous.chain, base=held))

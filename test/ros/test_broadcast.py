@@ -19,6 +19,7 @@ from urdfs import UR10E, by_kinpy
 
 from calib_ros.apply.simulation import Cell as SimulatedCell, faulty
 from calib_ros.errors import ConfigError
+from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain
@@ -68,9 +69,11 @@ def test_a_calibration_that_is_loaded_is_broadcast(tmp_path):
 
 def broadcast(chain, world='leica', in_hand=False, urdf='', outdated=(), **names):
     given = SimpleNamespace(links={}, **(NAMES | names))
+    owners = {'base': ('', in_hand, False, '')}
+    more = {'world_frame': world, 'owners': owners, 'record': {'outdated': outdated}}
     with Cell() as cell:
         heard = cell.listen(TFMessage, '/tf_static')
-        Broadcast(cell.peer, given, urdf).publish(chain, world, in_hand, outdated)
+        Broadcast(cell.peer, given, urdf).publish(Calibration(chain, chain, **more))
         cell.spin_until(lambda: heard)
     return transforms(heard[0])
 

@@ -12,6 +12,7 @@ from geometry_msgs.msg import PoseStamped
 from ros_cell import STOPS, Cell, joint_messages, part, pose_messages, topics, values_of
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
+from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_ros.apply.simulation import measure, random_frame
@@ -82,11 +83,22 @@ def test_an_answer_says_that_the_device_was_moved_meanwhile(
     for message in poses[4 * first :]:
         message.pose.position.x += 0.02
     cell.play(topics(recording, measured_pose=poses))
-    answer = cell.call('identify')
-    assert (cell.node._keeper._published.outdated == ('base',)) == (first > STOPS / 2)
+    answer, late = cell.call('identify'), first > STOPS / 2
     assert answer.success == (first != STOPS / 2)
+    if answer.success:
+        cell.done('save')
+        told = '; base moved since: measure again' * late  # a file was published as it was
+        assert cell.done('load').message.partition(', made ')[2][10:] == told
+        assert cell.node.session.calibration.outdated == ('base',) * late
+        cell.node._keeper.publish_pose()
+        assert (cell.node._keeper._posed is None) == late
+        cell.done('record', SetBool.Request(data=False))
+        told = 'measure some new ones; not recording: call ~/record with true'
+        assert cell.refused('check').message.endswith(told)
     assert len(answer.message) <= ANSWER_LENGTH
     assert said.format(f'moved by 20 mm before pose {first + 1}') in answer.message
+    begin, *_ = answer.message.split(' ... ')  # which was "RMS 1.911"
+    assert ('RMS' in begin) == (' mm' in begin)
 
 
 def test_the_status_is_short_and_its_first_words_matter(monkeypatch, cell, recording):
