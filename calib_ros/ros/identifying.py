@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -273,12 +274,19 @@ class Identifying:
             said, advice, end = self._short
             end += f' ... full text: {path.name if path else "in the log"}'
             longest = (ANSWER_LENGTH - len(end)) * 3 // 4
-            advice = advice and f' ... {textwrap.shorten(advice, longest, placeholder="")}'
+            advice = advice and f' ... {_cut(advice, longest)}'
             room = ANSWER_LENGTH - len(advice + end)
             if success or advice:
-                said = textwrap.shorten(said, room, placeholder='' if advice else ' ...')
+                gap = ' ...' * (len(said) > room and not advice)
+                said = _cut(said, room - len(gap)) + gap
             text = shortened(said or text, room) + advice + end
         return success, text
+
+
+def _cut(text: str, longest: int) -> str:
+    """Return a text without its last words if too long; half of "RMS 2 -> 1 mm" misleads."""
+    glued = re.sub(r'(?<=\d) | (?=\d)', '\0', text)
+    return textwrap.shorten(glued, longest, placeholder='').rstrip(',;:').replace('\0', ' ')
 
 
 def _moved(result: Identification, given: Snapshot) -> str:

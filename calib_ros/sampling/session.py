@@ -374,7 +374,9 @@ class CalibrationSession:
         frames = Frames(calibration.owners) if calibration.owners else named(self.usable)
         sets = [each for _, each in collect(since, self.settings.sigmas, frames)]
         if not sets:
-            raise InputError('no poses since the calibration came into use: measure some new ones')
+            told = next((each.status for each in self.last_hints if each.status), self.state)
+            text = 'no poses since the calibration came into use: measure some new ones'
+            raise InputError(f'{text}; {told}')
         known = calibration.chain.frame_names
         if not all(each.base in known and each.tool in known for each in sets):
             raise InputError('the new poses are of a device or target unknown to the calibration')
