@@ -81,6 +81,15 @@ def is_time(stamp_ns: int) -> bool:
     return stamp_ns >= 10**17
 
 
+def interval_mm(lower: float, upper: float) -> str:
+    """Return an interval [mm] with as many decimals at both ends, if the upper one has any."""
+    if np.isinf(upper):
+        return f'at least {rounded(lower)}'
+    end = rounded(upper)
+    decimals = len(end.partition('.')[2])
+    return f'{f"{lower:.{decimals}f}" if decimals else rounded(lower)} to {end}'
+
+
 def moment(stamp_ns: int | np.int64) -> str:
     """Return a stamp as a time, or as seconds, to a millisecond."""
     seconds, rest = divmod(int(stamp_ns) // 10**6, 1000)

@@ -22,8 +22,7 @@ from calib_ros.apply.design import Design
 from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.reasons import Reason, Rule
-from calib_ros.report.words import interval_mm
-from calib_ros.shown import Shown, moment, rounded, rows_in_words, two_digits
+from calib_ros.shown import Shown, interval_mm, moment, rounded, rows_in_words, two_digits
 
 CHAIN = calib_ros.load_chain('ur10e')
 JOINTS = CHAIN.random_joints(200, np.random.default_rng(1))

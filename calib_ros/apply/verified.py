@@ -13,7 +13,7 @@ from calib_ros.apply.judgement import Judgement
 from calib_ros.decision.moved import Step
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.shown import LISTED, Shown, as_html, rounded
+from calib_ros.shown import LISTED, Shown, as_html, interval_mm, rounded
 
 
 class Attained(NamedTuple):
@@ -60,8 +60,8 @@ class Verification(Judgement, Shown):
 
     def _repr_html_(self) -> str:
         before, after = self.comparison.figures
-        ends = ' to '.join(rounded(1e3 * each) for each in (self.lower, self.upper))
-        like = f'RMS over poses like these ({100 * self.confidence:g} %: {ends})'
+        between = interval_mm(1e3 * self.lower, 1e3 * self.upper)
+        like = f'RMS over poses like these ({100 * self.confidence:g} %: {between})'
         rows = (
             ('position error [mm]', 'before', 'after'),
             ('RMS', rounded(before.rms_mm), rounded(after.rms_mm)),

@@ -14,9 +14,9 @@ from calib_ros.decision.comparison import log_gain
 from calib_ros.estimation.levels import CERTAIN, NEARER
 from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.kinematics.se3 import norms
-from calib_ros.report.words import interval_mm, turned_in_words
+from calib_ros.report.words import turned_in_words
 from calib_ros.settings import Settings
-from calib_ros.shown import rounded, sentence, some
+from calib_ros.shown import interval_mm, rounded, sentence, some
 
 
 def likely_rms(found: Verification) -> str:

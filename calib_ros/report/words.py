@@ -26,7 +26,7 @@ from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.report.advice import COARSE, FAR
 from calib_ros.settings import Settings
-from calib_ros.shown import counted, moment, of_them, rounded, some
+from calib_ros.shown import counted, interval_mm, moment, of_them, rounded, some
 from calib_ros.values import SAME
 
 WEAK = Settings.largest_error
@@ -89,15 +89,6 @@ def rms_range_mm(judged: Comparison | None, when: int) -> str:
     """Return the 95 % interval [mm] of the RMS before (0) or after (1), empty if unknown."""
     limits = limits_mm(judged, when)
     return '' if limits is None else interval_mm(*limits)
-
-
-def interval_mm(lower: float, upper: float) -> str:
-    """Return an interval [mm] with as many decimals at both ends, if the upper one has any."""
-    if np.isinf(upper):
-        return f'at least {rounded(lower)}'
-    end = rounded(upper)
-    decimals = len(end.partition('.')[2])
-    return f'{f"{lower:.{decimals}f}" if decimals else rounded(lower)} to {end}'
 
 
 def limits_mm(judged: Comparison | None, when: int) -> list[float] | None:

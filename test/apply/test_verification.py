@@ -98,6 +98,9 @@ def test_pass_fail_and_undecided(cell, arm, program):
     assert '<strong>UNDECIDED</strong>' in shown
     for value in (near.rms, near.lower, near.upper, near.limit):
         assert rounded(1e3 * value) in shown
+    assert (
+        f'95 %: at least {rounded(1e3 * near.lower)})' in replace(near, upper=np.inf)._repr_html_()
+    )
     errors = 1e3 * near.comparison.after.position[near.group == 2]
     assert near.each[2].after == pytest.approx(np.linalg.norm(errors.mean(axis=0)))
     heads = [line.split() for line in text.splitlines()]
