@@ -25,6 +25,7 @@ from calib_ros.kinematics.joint import small_units
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.report.advice import COARSE, FAR
+from calib_ros.sampling.slices import NO_ACCIDENT
 from calib_ros.settings import Settings
 from calib_ros.shown import counted, interval_mm, moment, of_them, rounded, some
 from calib_ros.values import SAME
@@ -214,6 +215,9 @@ def verdict_in_words(found: Judgement) -> str:
         if found.noise and found.needed is None:
             if found.overstated:
                 return f'no verdict: {found.overstated}; {told}'
+            if found.unstated and found.configurations < NO_ACCIDENT:
+                told = f'noise of the device from a change: {told}; measure more'
+                return f'too few poses to tell {told}, or set sigma_position of another device'
             return (
                 f'the device has too much noise to tell: {told}; use a device as accurate as that '
                 'of the calibration'

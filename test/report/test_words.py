@@ -99,6 +99,10 @@ def test_noise_that_no_number_of_poses_overcomes_asks_for_no_more_of_them():
     told = verdict_in_words(replace(found, noise=1e-4, needed=None))
     assert told.startswith('the device has too much noise to tell')
     assert told.endswith('use a device as accurate as that of the calibration')
+    few = judge(Calibration(arm, arm, residual=1e-4), [SEEN], off_by(*[0.16] * 3))
+    told = verdict_in_words(replace(few, noise=1e-4, needed=None))  # of two, a bump is as likely
+    assert told.startswith('too few poses to tell noise of the device from a change: RMS 0.160')
+    assert told.endswith('measure more, or set sigma_position of another device')
 
 
 def test_a_mistake_is_named_instead_of_a_verdict():
