@@ -13,11 +13,11 @@ from scipy import special
 from calib_ros.annotated import Count, NotNegative, Share, as_annotated
 from calib_ros.decision.comparison import Comparison, GroupVerdict
 from calib_ros.decision.misfits import Outlier
-from calib_ros.decision.moved import Step
+from calib_ros.decision.moved import FROM_THERE, Step
 from calib_ros.decision.reasons import Reason
 from calib_ros.decision.region import Region
 from calib_ros.estimation.fitted import ParameterRow
-from calib_ros.estimation.levels import CONFIDENT, KNOWN
+from calib_ros.estimation.levels import CONFIDENT, KNOWN, LEAST_ASIDE
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observability import correlated
 from calib_ros.estimation.posterior import Posterior
@@ -173,6 +173,20 @@ class Identification(Shown):
     def correlated(self, threshold: NotNegative = 0.9) -> tuple[tuple[str, str, float], ...]:
         """Return pairs of parameters whose correlation exceeds a threshold, strongest first."""
         return correlated(self.covariance, self.names, threshold)
+
+    @property
+    def outdated(self) -> tuple[str, ...]:
+        """Return the frames that moved since; all of a set whose last poses are outliers."""
+        step, found = self.step, list[str]()
+        if step and step.unused == FROM_THERE:
+            return step.owners if step.outdated else ()
+        for number, each in enumerate(self.problem.sets):
+            order = np.argsort(each.stamps_ns, kind='stable')[::-1]
+            out = np.isin(order, [one.sample for one in self.outliers if one.set == number])
+            last = order[: int(np.argmin(np.append(out, False)))]
+            if len({*each.configurations[last].tolist()}) >= LEAST_ASIDE:
+                found += [each.base, each.tool]
+        return tuple(dict.fromkeys(found))
 
     def to_frame(self) -> Any:
         """Return the parameters as a pandas.DataFrame [m, rad]; `within_95` are half widths."""

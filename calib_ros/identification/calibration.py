@@ -122,7 +122,7 @@ class Calibration(Shown):
             'not_identifiable': list(result.unidentifiable),
             **about(result.chain, result.before, region),
             'frames': records.owners_document(owners),
-            'outdated': [*result.step.owners] if result.step and result.step.outdated else [],
+            'outdated': [*result.outdated],
             **(origin or {}),
         }
         return cls(

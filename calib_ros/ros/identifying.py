@@ -214,7 +214,7 @@ class Identifying:
         hint = next(iter((*loaded.warnings, *words.other_remarks(result))), '')
         moved, nearer = _moved(result, given), _nearer(result, given.since)
         self.last = words.summary(result, numbers, loaded.warnings, first)
-        if moved and result.step and not result.step.slow:  # else told already
+        if moved and not (result.step and result.step.slow):  # else told already
             self.last += f'; {moved}'
         said, advice = words.verdict(result), moved or nearer or brief or hint
         if telling or (moved and not result.accepted):
@@ -292,6 +292,9 @@ def _cut(text: str, longest: int) -> str:
 def _moved(result: Identification, given: Snapshot) -> str:
     """Tell what moved, if the result is accepted, or refused for that."""
     step, refusals = result.step, result.refusals
+    if result.accepted and result.outdated and not (step and step.outdated):
+        frames = ' or '.join(result.outdated)
+        return f'the last poses do not fit, did {frames} move? Measure again after ~/clear'
     if step is None or (refusals and given.cause and step.kind in IN_THE_CELL):
         return ''
     if refusals and refusals[0].rule not in (Rule.MOVED, Rule.ENCODER):

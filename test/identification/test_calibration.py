@@ -14,6 +14,7 @@ from fits import UR10E as UR, measured_arm
 
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.matrices import unpacked_matrix
+from calib_ros.decision.misfits import Outlier
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.observations import Observations
@@ -74,6 +75,15 @@ def test_joints_keep_the_limits_of_the_file_and_of_the_nominal_chain(found):
 def document(found):
     """Return what its file holds, without the region, which takes long to read."""
     return yaml.safe_load(replace(found, record={**found.record, 'region': None}).dump())
+
+
+@pytest.mark.parametrize('count', [2, 3])
+def test_frames_by_which_the_last_poses_are_outliers_are_outdated(count):
+    """Of a target that moved twice the first move was told, and the frame after it published."""
+    *_, seen = measured_arm(0, 40, (1e-4, 3e-4))
+    last = tuple(Outlier(0, k, int(seen.stamps_ns[k]), 9.0) for k in range(40 - count, 40))
+    result = replace(identify(Problem(UR, seen)), outliers=last)
+    assert Calibration.of(result).outdated == ('base', 'tool') * (count > 2)
 
 
 @pytest.mark.parametrize(('a', 'true'), [(0.043, 0.045), (0.045, 0.043)])
