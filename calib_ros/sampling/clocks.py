@@ -185,8 +185,10 @@ class Clocks:
         delay, known = self.delay, self.settings.delay
         if self._moves:
             found.append(clocks_moved(self._moves))
-        elif delay is not None and not self._continuous and self._spoils(delay.seconds):
-            found.append(disagreement(delay.seconds, known))  # in motion it is fitted
+        elif delay is not None and not self._continuous:  # in motion it is fitted
+            within = max(delay.within - SMOOTHING, 0.0)  # of measurements at stops alone
+            if self._spoils(delay.seconds, within):
+                found.append(disagreement(delay.seconds, known))
         unclear = self._found if self._continuous else self._unclear
         if unclear is not None and unclear.rivals and not known:
             delays = (unclear.seconds, *unclear.rivals)
@@ -198,5 +200,6 @@ class Clocks:
         """Report that a target moved while no joint did."""
         return [stuck(1e-9 * WATCH_NS * self._deaf, self._stuck)] if self._deaf else []
 
-    def _spoils(self, delay: float) -> bool:
-        return not -EARLY <= delay - self.settings.delay <= self.settings.settle
+    def _spoils(self, delay: float, within: float = 0.0) -> bool:
+        more = delay - self.settings.delay
+        return not -EARLY - within <= more <= self.settings.settle + within

@@ -209,6 +209,20 @@ def test_stops_spoilt_by_a_delay_are_told(lag, settings, said):
     assert np.sqrt((errors**2).mean()) < (0.5 * NOISE[0] if early else 1.3 * expected)
 
 
+def test_measurements_at_stops_alone_tell_a_delay_roughly():
+    """They began as the arm arrived: where clocks agreed, a delay of -0.05 s was to be set."""
+    true, _, rng = true_cell(1)
+    motion, joint_times = stops(UR10E.random_joints(25, rng), 0.6, 1.0), np.arange(0.0, 30.0, 0.02)
+    times = (1.6 * np.arange(18)[:, np.newaxis] + 0.1 * np.arange(10)).ravel()
+    seen = measure(true, motion(times), rng, *NOISE)
+    for lag in (0.0, 0.3):
+        session, joints = CalibrationSession(UR10E), motion(joint_times)
+        told(session, joint_times, joints, times, seen.positions, seen.rotations, lag)
+        session.finish()
+        assert session.delay.seconds == pytest.approx(lag, abs=0.1)
+        assert ('stamps disagree: set delay' in session.status()) == (lag > 0.0)
+
+
 def test_joints_published_in_parts_show_a_delay():
     """They were not watched: the advice was to set settle."""
     true, _, rng = true_cell(0)
