@@ -23,9 +23,10 @@ from calib_ros.decision.trials import position_fault_limit
 from calib_ros.estimation.configurations import STILL, count_distinct
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.identifiability import DEGENERATE
-from calib_ros.estimation.levels import ALIKE, MOST_OUTLIERS
+from calib_ros.estimation.levels import ALIKE, MOST_OUTLIERS, NEARER
 from calib_ros.estimation.posterior import Posterior
 from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.trimmed import most_left_out
 from calib_ros.kinematics import effects
 from calib_ros.settings import EXCEPTION
 from calib_ros.shown import some
@@ -56,6 +57,8 @@ def refusals(
             failed.append(result.step.reason)
         text = f'{100.0 * share:.0f} % of the judged poses are outliers'
         return (*failed, Reason(Rule.OUTLIERS, text))
+    if hiding := _hidden_outliers(problem, result):
+        failed.append(Reason(Rule.OUTLIERS, hiding))
     gained = tuple(gain_refusals(problem, result, validation, sized, scaled))
     before, after = validation.figures
     helps = after.rms_mm < before.rms_mm or all(each.rule is not Rule.GAIN for each in gained)
@@ -63,6 +66,21 @@ def refusals(
         # of a fit that explains nothing the parameters tell nothing
         failed = [each for each in failed if each.rule is not Rule.COMMON_SENSE]
     return (*failed, *gained, *harm_refusals(validation, may_be_rounding, helps))
+
+
+def _hidden_outliers(problem: Problem, result: Identification) -> str:
+    """Return that as many gross errors were found as can be, and the rest does not fit either."""
+    found, size = len(result.outliers), result.noise.position
+    alone = replace(problem, learned=None)
+    if not found or size <= 1.0 / NEARER:
+        return ''
+    if found < most_left_out(result.names, alone.system(problem.sets)):
+        return ''
+    count = sum(map(len, problem.sets))
+    return (
+        f'{found} of {count} poses are outliers, the most that so few can show, and the others are '
+        f'{size:.1f} times as far off as the stated sigma: more may be among them'
+    )
 
 
 def _fit_refusals(

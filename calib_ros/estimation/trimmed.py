@@ -61,6 +61,12 @@ def trimmed_sum(chain: Chain, system: System) -> float:
     return float(sum(np.sort(each)[: (len(each) + 1) // 2].sum() for each in sets))
 
 
+def most_left_out(names: Sequence[str], system: System) -> int:
+    """Return how many samples the best half leaves out, all parameters being without priors."""
+    halves = _Halves(system, min(_need(names, system), 1.0))
+    return sum(samples.count for samples in system.sets) - sum(halves.sizes)
+
+
 def squared_residuals(chain: Chain, system: System) -> FloatArray:
     """Return the squared residuals (N,) of the samples of all sets, in sigma."""
     sets = (map(np.nan_to_num, samples.whitened_residuals(chain)) for samples in system.sets)
@@ -89,7 +95,7 @@ class _Halves:
         ends = np.cumsum([0, *(samples.count for samples in system.sets)]).tolist()
         self.parts = [slice(first, last) for first, last in pairwise(ends)]
         self._groups = [samples.observations.configurations for samples in system.sets]
-        self._sizes = [int(np.ceil(0.5 * (1.0 + need) * s.count)) for s in system.sets]
+        self.sizes = [int(np.ceil(0.5 * (1.0 + need) * s.count)) for s in system.sets]
 
     def draw(self, need: float) -> Flags:
         """Return seeded starts: of every set half the configurations that all parameters need.
@@ -107,7 +113,7 @@ class _Halves:
     def concentrate(self, squares: FloatArray) -> tuple[Flags, FloatArray]:
         """Return the samples with the shortest residuals, and the sums (S,) of their squares."""
         masks = np.zeros(squares.shape, dtype=bool)
-        for part, size in zip(self.parts, self._sizes, strict=True):
+        for part, size in zip(self.parts, self.sizes, strict=True):
             index = np.argpartition(squares[:, part], size - 1, axis=1)[:, :size]
             np.put_along_axis(masks[:, part], index, True, axis=1)
         return masks, (squares * masks).sum(axis=1)

@@ -15,7 +15,7 @@ from calib_ros.decision.rounding import error_by_rounding
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.problem import Problem
 from calib_ros.report import words
-from calib_ros.report.advice import BRINGS, Situation, advice
+from calib_ros.report.advice import BRINGS, ENOUGH, Situation, advice
 from calib_ros.report.refusals import GOOD_ARM, GOOD_HERE, Advice
 
 
@@ -50,7 +50,7 @@ def advice_of(problem: Problem, result: Identification) -> tuple[Advice, ...]:
     alone = all(each.socket or each.pixels is not None for each in problem.all_sets)
     marks |= {'no_sockets': not any(sockets), 'no_device': alone}
     marks |= {'no_linear': all(joint.driven.unit == 'rad' for joint in problem.chain.joints)}
-    marks |= {'zeros': zeros, 'lengths': not zeros}
+    marks |= {'zeros': zeros, 'lengths': not zeros, 'many': poses >= ENOUGH}
     needless = tuple(mark for mark, holds in marks.items() if holds)
     remains = result.comparison.figures[1].rms_mm
     rounded_by = 1e3 * error_by_rounding(problem, result.chain)
