@@ -19,6 +19,7 @@ from calib_ros.values import LARGEST
 
 AT = ' at'  # no attribute has such a name
 _DOCTYPE = re.compile(r'<!DOCTYPE|<!ENTITY', re.IGNORECASE)
+_NOT_READ = re.compile(rb'<\?.*?(?:\?>|\Z)|<!--.*?(?:-->|\Z)', re.DOTALL)
 
 
 def robot_of(text: str) -> ET.Element:
@@ -44,7 +45,8 @@ def robot_of(text: str) -> ET.Element:
 def parsed(text: str) -> ET.Element:
     """Return the elements of a text, each with its first byte as an attribute.
 
-    Prefixes need no declaration, as in ROS.
+    As in ROS, prefixes need no declaration, comments may hold --, and blanks or comments may come
+    before <?xml.
     """
     builder, parser = ET.TreeBuilder(), expat.ParserCreate()
 
@@ -52,7 +54,8 @@ def parsed(text: str) -> ET.Element:
         builder.start(tag, attributes | {AT: str(parser.CurrentByteIndex)})
 
     parser.StartElementHandler, parser.EndElementHandler = start, builder.end
-    parser.Parse(text, True)
+    blanks = _NOT_READ.sub(lambda part: re.sub(rb'[^\n]', b' ', part[0]), text.encode())
+    parser.Parse(blanks, True)
     return builder.close()
 
 

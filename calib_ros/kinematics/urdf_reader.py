@@ -46,7 +46,8 @@ def parse_urdf(text: str) -> Description:
     children = {joint.child for joint in joints}
     roots = [name for name in links if name not in children]
     if len(roots) != 1:
-        found = ', '.join(roots) or 'none'
+        none = 'none' if links else 'none, it has no links: an SRDF, or a macro nobody called?'
+        found = ', '.join(roots) or none
         raise ConfigError(
             f'the links of a URDF must form a tree with one root; roots here: {found}'
         )
@@ -99,7 +100,10 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
             for key, default in (('multiplier', '1'), ('offset', '0'))
         )
         follows = mimic.get('joint', ''), ratio, offset
-    origin, rpy = placed(child_of(element, 'origin'), f'origin of {where}')
+    at = child_of(element, 'origin')
+    if at.get('quat_xyzw'):
+        raise ConfigError(f'quat_xyzw of {where} is not supported: write the rotation as rpy')
+    origin, rpy = placed(at, f'origin of {where}')
     if (most := np.abs(rpy).max()) > 4.0 * math.pi:  # two turns
         raise ConfigError(
             f'the rpy of {where} must be in radians, not {most:g}: is it in degrees?'

@@ -218,8 +218,8 @@ def edited(text, old, new):
     return text.replace(old, new)
 
 
-def test_prefixes_need_no_declaration():
-    """Simulators add attributes of their own, such as drake:acceleration; ROS reads such files."""
+def test_what_ros_reads_is_read():
+    """Attributes of simulators, as drake:acceleration; comments with --, and before <?xml."""
     limited = edited(UR10E, '<limit ', '<limit drake:acceleration="2.5" ')
     chain = chain_from_urdf(limited)
     named = edited(UR10E, '<robot ', '<robot xmlns="http://ros.org" ')
@@ -229,6 +229,8 @@ def test_prefixes_need_no_declaration():
     longer = chain.with_offsets({'elbow_joint.d': 1e-3})
     edits = corrected_urdf(noted, longer).replace('drake:note="0" ', '')
     assert edits == corrected_urdf(UR10E, longer)
+    head = '\n<!-- Größe -- a & b --><?xml version="1.0" encoding="latin-1"?>\n'
+    assert corrected_urdf(head + UR10E, longer) == head + corrected_urdf(UR10E, longer)
 
 
 def elbow(kind, more=''):
@@ -255,7 +257,9 @@ REFUSED = {
     'a path': ('arm.urdf', 'expected its text: load_chain reads a file'),
     'cut off': (UR10E[:-40], 'not valid XML'),
     'no robot': ('<sdf/>', 'root element <robot>, not <sdf>: convert it'),
-    'empty': ('<robot/>', 'tree with one root; roots here: none'),
+    'empty': ('<robot/>', 'one root; roots here: none, it has no links: an SRDF, or a macro'),
+    'comment': (edited(UR10E, '</robot>', '<!-- ' * 200_000 + '</robot>'), 'not valid XML'),
+    'quaternion': (edited(UR10E, ' rpy="0.0', ' quat_xyzw="0 0 0 1" rpy="0.0'), 'write the rot'),
     'xacro': (edited(UR10E, '</robot>', XACRO), 'run "xacro FILE > robot.urdf" first'),
     'formula': (edited(UR10E, '-0.6127', '${a}'), '"elbow_joint" is a formula'),
     'two numbers': (edited(UR10E, '-0.6127 0.0', '0'), '3 finite numbers, not "0 0.0"'),
