@@ -78,7 +78,8 @@ def structurally_independent(
     further equations at a chain.
 
     Parameters of which those before them leave little come last: with a known tool near the last
-    axis a turn would else imitate a length, and end far away.
+    axis a turn would else imitate a length, and end far away; the height of a SCARA's tool would
+    take the place of its elbow's zero if pi has five digits in its URDF.
     """
     anywhere, rows = drawn(chain, names, sets)
     if extra is not None:
@@ -91,7 +92,7 @@ def independent_in(rows: Sequence[FloatArray], names: Sequence[str]) -> tuple[st
     lens = [k for k, name in enumerate(names) if Parameter(name).of_lens]
     every = [*map(_compact, rows), np.eye(len(names))[lens]]
     first = np.asarray(np.linalg.qr(np.concatenate(every), mode='r'))
-    least = [HALF_THE_DIGITS if Parameter(n).kind in FRAME_KINDS else EXCEPTION for n in names]
+    least = [DEGENERATE if Parameter(n).kind in FRAME_KINDS else EXCEPTION for n in names]
     strong = independent(first, names, np.array(least))
     order = sorted(range(len(names)), key=lambda k: names[k] not in strong)
     factor = np.asarray(np.linalg.qr(first[:, order], mode='r'))
@@ -100,8 +101,8 @@ def independent_in(rows: Sequence[FloatArray], names: Sequence[str]) -> tuple[st
 
 
 def _compact(rows: FloatArray) -> FloatArray:
-    """Return R (K, P) with the products of rows (R, P), of which some columns are zero."""
+    """Return R (K, P) of rows (R, P) of any unit, of which some columns are zero."""
     used = np.flatnonzero(rows.any(axis=0))
     factor = np.zeros((min(len(rows), len(used)), rows.shape[1]))
     factor[:, used] = np.linalg.qr(rows[:, used], mode='r')
-    return factor
+    return factor / (np.abs(factor).max(initial=0.0) or 1.0)

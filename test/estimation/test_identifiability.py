@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, measured_arm
+from fits import NOISE, SCARA, SIGMAS, UR10E, measured_arm
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.estimation.gauges import best_imitation, identifiable_and_held
-from calib_ros.estimation.identifiability import independent
+from calib_ros.estimation.identifiability import independent, structurally_independent
 from calib_ros.estimation.observability import correlated, observability, trades
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
@@ -81,6 +81,17 @@ def test_lengths_along_parallel_axes_trade_where_no_tilt_is_modelled(exact, rng)
     assert_trades_hold(result, UR10E.random_joints(100, rng))
     assert result.gauges['wrist_3_joint.d'] == ['tool.z']
     assert result.gauges['elbow_joint.d']
+
+
+@pytest.mark.parametrize('pi', [3.14159, 3.1416, 3.141])
+def test_a_pi_of_few_digits_hides_the_height_of_a_tool_as_well(pi):
+    joints = [replace(each, alpha=pi) if each.alpha else each for each in SCARA.joints]
+    found, expected = (
+        structurally_independent(chain, chain.parameter_names)
+        for chain in (replace(SCARA, joints=tuple(joints)), SCARA)
+    )
+    assert found == expected
+    assert 'tool.z' not in found
 
 
 def test_a_joint_that_stands_still_trades_on_the_poses_measured(rng):
