@@ -176,6 +176,8 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> Loaded:
     refuse_larger('sigma_touch', options.sigma_touch or 0.0, TOUCH_SIGMA)
     if options.detections is not None:
         return _detected(options, chain, screen)
+    if posed:
+        raise InputError(f'--chain {image_places.POSED} needs --detections, with --places')
     if source == 'table':
         found = inputs.table_of(options, options.csv, chain, screen)
         return load_table(found, chain, common.settings_of(options), options.sigma_touch)

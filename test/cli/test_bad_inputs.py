@@ -50,6 +50,7 @@ def bad_inputs():
     for alone in (('--board', 'b'), ('--places', 'p'), ('--intrinsics', 'i'), ('--lens', 'given')):
         yield f'{alone[0]} alone', (*good, *alone), f'{alone[0]} needs --detections'
     yield 'corners of nothing', (*bag_of, '--detections', 'c.csv'), '--detections needs --board\n'
+    yield 'an arm of images', (*chain_of, 'flange_pose'), 'flange_pose needs --detections'
     yield 'no serial', (*good, '--history', 'h'), '--history files results by serial number: add'
     yield 'a layout of nothing', (*good, '--joints-preset', 'kuka'), ' needs --joints'
     of_bag = (*bag_of, 'folder', '--joints-preset', 'kuka')
