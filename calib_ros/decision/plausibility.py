@@ -313,8 +313,9 @@ def _sigmas(problem: Problem, result: Identification) -> str:
         ('position', 'm', noise.position, problem.largest_error),
         ('orientation', 'rad', noise.orientation, problem.largest_angle),
     )
-    best, judged = 1e3 * EXCEPTION * TYPICAL['length'], result.validation
-    computed = judged is not None and judged.figures[0].rms_mm < best
+    away = np.abs(result.chain.frame(problem.observations.base).matrix - np.eye(4)).max()
+    computed = bool(away < TYPICAL['frame'] / EXCEPTION)  # in the controller's own frame
+    computed |= result.comparison.figures[0].rms_mm < 1e3 * EXCEPTION * TYPICAL['length']
     moved = result.step is not None and result.step.harmful  # and may have turned
     turned = 0.0 if moved or noise.orientation is None else noise.orientation
     wide = turned > 1.0 > CLEARLY * noise.position
@@ -325,12 +326,11 @@ def _sigmas(problem: Problem, result: Identification) -> str:
         each = np.concatenate([part[:, 3 * k : 3 * k + 3] for part in variances])
         given = float(np.sqrt(np.median(each.mean(axis=1))))
         own = not np.isclose(given, sigmas[k])
-        stated = own or sigmas[k] != getattr(Settings, f'sigma_{what}')
+        stated = computed or own or sigmas[k] != getattr(Settings, f'sigma_{what}')
         name = f'sigma_{what} is' if not own else f'by the covariances the {what} is known to'
         name = f'{name} {given:.2g} {unit}'
         left = f'{1e3 * size * given:.2g} m{unit} are left'
-        implausible = size < LEAST_NOISE or given > most
-        if (stated or computed) and SIMULATED < size * given < given and implausible:
+        if stated and SIMULATED < size * given < given and (size < LEAST_NOISE or given > most):
             asked = f'was m{unit} meant?'
             if computed:
                 asked = 'no arm is as good: did its controller compute the poses?'

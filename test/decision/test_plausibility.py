@@ -16,7 +16,7 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.gross_errors import SUSPICIOUS
 from calib_ros.estimation.system import stacked
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import Joint
+from calib_ros.kinematics.chain import Frame, Joint
 from calib_ros.kinematics.se3 import exp_rotation
 
 UR = load_chain('ur10e')
@@ -139,10 +139,12 @@ def test_a_default_sigma_is_no_mistake_of_its_user():
 def test_poses_computed_by_a_controller_are_named():
     """Rounded to micrometres they look like those of a device a hundred times better than any."""
     rng = np.random.default_rng(0)
-    result = identify(Problem(UR, measure(UR, UR.random_joints(25, rng), rng, 2e-6, 5e-6)))
-    said = result.refusals[0]
-    assert said.startswith('sigma_position is 0.0001 m, and only 0.00')
-    assert said.count('no arm is as good: did its controller compute the poses?') == 2
+    calibrated = replace(arm(0), base=Frame())  # by its maker, and in its own base frame
+    for true in (UR, calibrated):
+        result = identify(Problem(UR, measure(true, UR.random_joints(25, rng), rng, 2e-6, 5e-6)))
+        said = result.refusals[0] if true is UR else result.remarks[0]
+        assert said.startswith('sigma_position is 0.0001 m, and only 0.00')
+        assert said.count('no arm is as good: did its controller compute the poses?') == 2
 
 
 def test_a_mistake_is_told_before_the_sigmas_that_it_meets():

@@ -199,7 +199,8 @@ def test_orientations_outweigh_positions_that_are_as_stated(position, orientatio
     poses = Observations.from_arrays(np.zeros((4, 6)), np.zeros((4, 3)), [np.eye(3)] * 4)
     problem = Problem(UR, poses, sigma_position=1e-4, sigma_orientation=3e-4)
     noise = SimpleNamespace(consistent=False, position=position, orientation=orientation)
-    result = SimpleNamespace(noise=noise, validation=None, step=None)
+    judged = SimpleNamespace(figures=(SimpleNamespace(rms_mm=1.0),))
+    result = SimpleNamespace(noise=noise, comparison=judged, step=None, chain=UR)
     found = plausibility._sigmas(problem, result)
     assert told in found
     assert bool(found) == bool(told)
