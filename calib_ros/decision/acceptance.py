@@ -78,8 +78,8 @@ def _hidden_outliers(problem: Problem, result: Identification) -> str:
         return ''
     count = sum(map(len, problem.sets))
     return (
-        f'{found} of {count} poses are outliers, the most that so few can show, and the others are '
-        f'{size:.1f} times as far off as the stated sigma: more may be among them'
+        f'{found} of {count} poses are outliers, the most that so few can show, and the others are'
+        f' {size:.1f} times as far off as the stated sigma: more may be among them'
     )
 
 
