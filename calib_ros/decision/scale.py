@@ -52,7 +52,10 @@ def out_of_scale(scale: float, length: str = '', stated: float = 0.0, strain: fl
     Linear joints imitate a `strain`, by which it differs with the direction.
     """
     grown, size = _grown(scale, strain), 'large' if scale > 0.0 else 'small'
-    text = f'{grown}, as if the measuring device were out of scale; then'
+    steel, way = 1e5 * abs(scale), 'warmer' if scale > 0.0 else 'colder'  # 10 ppm a degree
+    warmth = f', or the arm {steel / 2.3:.0f} to {steel:.0f} degrees {way}'  # aluminium: 23 ppm
+    warmth *= abs(scale) <= LARGEST_SCALE
+    text = f'{grown}, as if the measuring device were out of scale{warmth}; then'
     check, what, usual = 'If a known length shows that its scale', 'scale of the device', SCALE
     if length:
         check, what, usual = f'Measure the {length}; if it', length, LARGEST_SCALE

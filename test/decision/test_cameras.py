@@ -136,7 +136,12 @@ def test_a_board_by_which_hardly_an_arm_grows_is_not_said_to_be_of_another_size(
     """A good SCARA was refused as lengths had shrunk alike, by 0.00049 %."""
     assert out_of_scale(9e-4, 'size of the board').startswith('the size of the board is not known')
     assert out_of_scale(6e-6).startswith('the scale of the device is not known well enough: the')
-    assert 'grow alike, by 0.011 %, as if the measuring device' in out_of_scale(1.1e-4)
+    device = 'as if the measuring device were out of scale'
+    assert f'by 0.023 %, {device}, or the arm 10 to 23 degrees warmer; then' in out_of_scale(
+        2.3e-4
+    )
+    assert f'{device}, or the arm 40 to 92 degrees colder; then' in out_of_scale(-9.2e-4)
+    assert f'{device}; then' in out_of_scale(1.1e-3)
     shrunk = out_of_scale(-1.1e-3, 'distance of the sockets')
     assert 'by 0.11 %, as if the distance of the sockets were stated too small' in shrunk
     assert 'at sigma_scale 0.01 %: measure poses all' in out_of_scale(1.1e-3, stated=1e-4)
