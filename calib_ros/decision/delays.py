@@ -64,7 +64,7 @@ def timed(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
                 told.append(
                     f'measurements of {base} are early or late by {two_digits(1e3 * jitter)} ms '
                     'at random: stamps jitter, or the device or the joint states are smoothed. '
-                    f'Errors along the motion count for less. {remedy}'
+                    f'Figures are without what that explains of errors. {remedy}'
                 )
     except (CalibrationError, np.linalg.LinAlgError):  # told by the whole fit
         pass
@@ -156,13 +156,15 @@ def _without_jitter(problem: Problem, base: str) -> tuple[Problem, float]:
 
 def _widened(fitted: Fitted, jitter: float, each: Observations) -> Observations:
     """Return measurements whose delay has a variance (of `jitter`, in that of the noise)."""
-    turned = np.full_like(each.oriented, each.oriented.any())
-    plain = Samples(each.changed(covariance=None, oriented=turned), 1.0, 1.0)
-    moved = plain.rows_of(fitted.chain, [Parameter(each.base, DELAY)])[0]
+    every = np.ones_like(each.oriented)
+    plain = Samples(each.changed(covariance=None, oriented=every), 1.0, 1.0)
+    moved = plain.rows_of(fitted.chain, [Parameter(each.base, DELAY)])[0].T
+    moved[~each.oriented, 3:] = 0.0
     problem = fitted.problem
-    wide = each.covariances((problem.sigma_position, problem.sigma_orientation))
-    wide[:, : len(moved), : len(moved)] += jitter * np.einsum('in,jn->nij', moved, moved)
-    return replace(each, covariance=wide)
+    given = each.covariances((problem.sigma_position, problem.sigma_orientation))
+    wide = given + jitter * np.einsum('ni,nj->nij', moved, moved)
+    kept = given if each.punctual is None else each.punctual @ given
+    return replace(each, covariance=wide, punctual=kept @ np.linalg.inv(wide))
 
 
 def _rows(problem: Problem) -> tuple[Fitted, list[FloatArray]]:

@@ -60,7 +60,7 @@ class Residuals:
 
 
 def residuals(chain: Chain, observations: Observations) -> Residuals:
-    """Return measured minus predicted for every pair."""
+    """Return measured minus predicted for every pair, without what stamps that jitter explain."""
     pixels = np.full((len(observations), 2), np.nan)
     if observations.pixels is not None:
         pixels, position = seen_residuals(chain, observations)
@@ -69,6 +69,10 @@ def residuals(chain: Chain, observations: Observations) -> Residuals:
         position, orientation = residual_arrays(chain, observations)
     if position.shape[1] == 1:  # a distance
         position = np.pad(position, ((0, 0), (0, 2)))
+    if observations.punctual is not None:
+        both = np.hstack([position, np.nan_to_num(orientation)])
+        both = np.einsum('nij,nj->ni', observations.punctual, both)
+        position, orientation = both[:, :3], both[:, 3:] + 0.0 * orientation
     return Residuals(position, orientation, observations.configurations, pixels)
 
 

@@ -90,11 +90,11 @@ def held_out_excess(
     if any(each.distances is not None or each.pixels is not None for each in sets):
         return 0.0, 1.0
     sigmas, found = (problem.sigma_position, problem.sigma_orientation), judged.figures[1].rms_mm
-    squares = [each.covariances(sigmas) for each in sets]
+    squares = [_judged(each, each.covariances(sigmas)) for each in sets]
     noise = fitted.noise.position * _rms_mm(squares, judged.deciding)
     if found <= ALIKE * noise:  # noise alone, as nearly always
         return 0.0, 1.0
-    squares = [posterior.expected(s.joints, s.base, s.tool, s.approach) for s in sets]
+    squares = [_judged(s, posterior.expected(s.joints, s.base, s.tool, s.approach)) for s in sets]
     expected = _rms_mm(squares, judged.deciding)
     if not expected:  # computed, without noise
         return 0.0, 1.0
@@ -104,6 +104,12 @@ def held_out_excess(
     if found <= likely * max(ALIKE, np.sqrt(special.chdtri(freedom, 1.0 - SURE) / freedom)):
         return 0.0, 1.0
     return found / likely, float(np.sqrt(found**2 - noise**2)) / expected
+
+
+def _judged(each: Observations, squares: FloatArray) -> FloatArray:
+    """Return the squares (N, 6, 6) of errors as they are judged."""
+    kept = each.punctual
+    return squares if kept is None else kept @ squares @ np.swapaxes(kept, 1, 2)
 
 
 def _alike(posterior: Posterior, sets: Sequence[Observations]) -> float:

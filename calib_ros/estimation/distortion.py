@@ -112,5 +112,6 @@ def device_sigma(samples: Samples) -> float:
     """Return the standard deviation [m] of a coordinate (RMS over samples)."""
     if samples.whitening is None:
         return samples.sigmas[0]
-    covariance = samples.observations.covariances(samples.sigmas)[:, :3, :3]
-    return float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 3.0))
+    seen, covariance = samples.observations, samples.observations.covariances(samples.sigmas)
+    covariance = covariance if seen.punctual is None else seen.punctual @ covariance
+    return float(np.sqrt(np.trace(covariance[:, :3, :3], axis1=1, axis2=2).mean() / 3.0))

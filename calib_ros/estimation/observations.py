@@ -24,7 +24,7 @@ _SHAPES: dict[str, tuple[int | None, ...]] = {
     **dict.fromkeys(('joints', 'approach', 'velocity', 'acceleration'), (None,)),
     **dict.fromkeys(('positions', 'points'), (3,)),
     'rotations': (3, 3),
-    'covariance': (6, 6),
+    **dict.fromkeys(('covariance', 'punctual'), (6, 6)),
     'pixels': (2,),
 }
 """Shapes per pair; None for the number of joints."""
@@ -61,6 +61,9 @@ class Observations(Shown):
     """(N, n) of the joints, if the arm was moving when measured."""
     delay: FloatArray | None = None
     """(N,) [s] before the stamps at which the joints had these values."""
+    punctual: FloatArray | None = None
+    """(N, 6, 6) matrices that leave of errors what no stamp early or late at random explains; they
+    also leave that part of `covariance`, which holds both."""
     base: str = 'base'
     tool: str = 'tool'
     """Frames of the chain for these pairs: names that begin with base, and with tool."""

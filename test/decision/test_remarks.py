@@ -346,7 +346,7 @@ def test_errors_are_widened_by_what_chance_does_not_explain(monkeypatch):
     def told(found, noise=3.0, expected=4.0, count=2, alike=0.25):
         monkeypatch.setattr(validation, '_alike', lambda *_: alike)
         square = 1e-6 / 3.0 * np.tile(np.eye(6), (count, 1, 1))
-        names = ('distances', 'pixels', 'joints', 'base', 'tool', 'approach')
+        names = ('distances', 'pixels', 'joints', 'base', 'tool', 'approach', 'punctual')
         seen = SimpleNamespace(**dict.fromkeys(names))
         seen.covariances = lambda sigmas: (0.5e4 * noise * sigmas[0]) ** 2 * square
         problem = SimpleNamespace(judging=[seen], sigma_position=1e-4, sigma_orientation=0.0)
