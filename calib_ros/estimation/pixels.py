@@ -96,6 +96,8 @@ class PixelSamples(Samples):
     def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
         """Yield the rows (P + 1, 2, C) of all points in blocks."""
         shifts = np.empty((self.count, 2, 3))
+        if not self.count:  # no images of this set are gross errors
+            yield (np.empty((len(names) + 1, 2, 0)),)
         for block in self.linearised(chain, names):
             for k in range(2):
                 unit = np.zeros((2, len(block.owner)))

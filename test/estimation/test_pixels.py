@@ -92,6 +92,7 @@ def test_products_are_those_of_the_rows(on_flange):
     sums = np.concatenate([each for _, (each,) in system.sets[0].sums(true, names, seen.images)])
     exact = np.add.reduceat(rows, np.flatnonzero(np.diff(seen.images, prepend=-1)), axis=2)
     np.testing.assert_allclose(sums, exact, atol=1e-9 * np.abs(exact).max())
+    assert not PixelSamples(seen.select(slice(0)), SIGMA).rows_of(true, names).size  # crashed
 
 
 @pytest.mark.parametrize(('seed', 'on_flange'), [(0, True), (5, False), (6, True), (7, False)])
