@@ -69,9 +69,15 @@ def refusals(
 
 
 def _hidden_outliers(problem: Problem, result: Identification) -> str:
-    """Return that as many gross errors were found as can be, and the rest does not fit either."""
-    found, size = len(result.outliers), result.noise.position
-    alone = replace(problem, learned=None)
+    """Return that as many gross errors were found as can be, and the rest does not fit either.
+
+    A stop measured again tells them itself, and so do the corners of an image.
+    """
+    found, size, alone = 0, result.noise.position, replace(problem, learned=None)
+    for number, each in enumerate(problem.sets):
+        stops = each.configurations
+        good = np.delete(stops, [one.sample for one in result.outliers if one.set == number])
+        found += int((~np.isin(stops, good)).sum()) * (each.pixels is None)
     if not found or size <= 1.0 / NEARER:
         return ''
     if found < most_left_out(result.names, alone.system(problem.sets)):

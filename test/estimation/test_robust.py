@@ -203,6 +203,20 @@ def test_few_poses_with_more_gross_errors_than_they_show_are_not_accepted(wrong,
     assert any(hidden in text for text in result.refusals) is refused
 
 
+def test_gross_errors_among_measurements_of_one_stop_hide_no_others():
+    """Beside a sigma stated too small, 14 of 54 were refused as the most that 9 stops show."""
+    rng = np.random.default_rng(2)
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, np.repeat(true.random_joints(9, rng), 6, axis=0), rng, 2e-4, 4e-4)
+    wrong = np.arange(54) % 6 < np.arange(54) // 6 % 3 + 1
+    wrong[::9] = False
+    positions = seen.positions + wrong[:, np.newaxis] * rng.normal(scale=0.01, size=(54, 3))
+    known = {'sigma_position': 5e-5, 'sigma_orientation': 1e-4}
+    result = identify(Problem(UR10E, replace(seen, positions=positions), **known))
+    assert len(result.outliers) == wrong.sum()
+    assert (result.accepted, result.refusals) == (True, ())
+
+
 def test_held_out_poses_that_do_not_belong_there_are_not_accepted(unsearched):
     """Most of them are another cell's: figures of the few that fit would tell nothing."""
     rng, true, seen, _ = cell(3)
