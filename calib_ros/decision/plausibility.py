@@ -314,10 +314,9 @@ def _sigmas(problem: Problem, result: Identification) -> str:
         ('orientation', 'rad', noise.orientation, problem.largest_angle),
     )
     away = np.abs(result.chain.frame(problem.observations.base).matrix - np.eye(4)).max()
-    computed = bool(away < TYPICAL['frame'] / EXCEPTION)  # in the controller's own frame
-    computed |= result.comparison.figures[0].rms_mm < 1e3 * EXCEPTION * TYPICAL['length']
-    moved = result.step is not None and result.step.harmful  # and may have turned
-    turned = 0.0 if moved or noise.orientation is None else noise.orientation
+    good = result.comparison.figures[0].rms_mm < 1e3 * EXCEPTION * TYPICAL['length']
+    computed = good or away < TYPICAL['frame'] / EXCEPTION  # in the controller's own frame
+    turned = 0.0 if result.step and result.step.harmful else noise.orientation or 0.0
     wide = turned > 1.0 > CLEARLY * noise.position
     outweighed = wide or turned > CLEARLY * max(noise.position, 1.0)
     for k, (what, unit, size, most) in enumerate(kinds):
@@ -326,14 +325,15 @@ def _sigmas(problem: Problem, result: Identification) -> str:
         each = np.concatenate([part[:, 3 * k : 3 * k + 3] for part in variances])
         given = float(np.sqrt(np.median(each.mean(axis=1))))
         own = not np.isclose(given, sigmas[k])
-        stated = computed or own or sigmas[k] != getattr(Settings, f'sigma_{what}')
-        name = f'sigma_{what} is' if not own else f'by the covariances the {what} is known to'
-        name = f'{name} {given:.2g} {unit}'
+        usual = getattr(Settings, f'sigma_{what}')
+        none_so_good = computed and size * given < LEAST_NOISE * usual
+        stated = none_so_good or own or sigmas[k] != usual
+        name = f'by the covariances the {what} is known to' if own else f'sigma_{what} is'
+        name += f' {given:.2g} {unit}'
         left = f'{1e3 * size * given:.2g} m{unit} are left'
         if stated and SIMULATED < size * given < given and (size < LEAST_NOISE or given > most):
-            asked = f'was m{unit} meant?'
-            if computed:
-                asked = 'no arm is as good: did its controller compute the poses?'
+            asked = 'no arm is as good: did its controller compute the poses?'
+            asked = asked if none_so_good else f'was m{unit} meant?'
             found.append(f'{name}, and only {left}: {asked}')
         elif outweighed and wide == (k == 0) and size * given < most:
             better = f'{"larger" if k else "smaller"} covariances'

@@ -145,6 +145,9 @@ def test_poses_computed_by_a_controller_are_named():
         said = result.refusals[0] if true is UR else result.remarks[0]
         assert said.startswith('sigma_position is 0.0001 m, and only 0.00')
         assert said.count('no arm is as good: did its controller compute the poses?') == 2
+    aligned = measure(calibrated, UR.random_joints(25, rng), rng, 5e-5, 2e-4)  # a device's
+    said = identify(Problem(UR, aligned, sigma_position=5e-3)).refusals[0]
+    assert str(said).endswith('mm are left: was mm meant?')
 
 
 def test_a_mistake_is_told_before_the_sigmas_that_it_meets():
