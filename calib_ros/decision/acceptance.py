@@ -73,14 +73,15 @@ def _hidden_outliers(problem: Problem, result: Identification) -> str:
 
     A stop measured again tells them itself, and so do the corners of an image.
     """
-    found, size, alone = 0, result.noise.position, replace(problem, learned=None)
+    found, size = 0, result.noise.position
+    if not result.outliers or size <= 1.0 / NEARER:
+        return ''
     for number, each in enumerate(problem.sets):
         stops = each.configurations
         good = np.delete(stops, [one.sample for one in result.outliers if one.set == number])
         found += int((~np.isin(stops, good)).sum()) * (each.pixels is None)
-    if not found or size <= 1.0 / NEARER:
-        return ''
-    if found < most_left_out(result.names, alone.system(problem.sets)):
+    alone = replace(problem, learned=None).system(problem.sets)
+    if not found or found < most_left_out(result.names, alone):
         return ''
     count = sum(map(len, problem.sets))
     return (

@@ -89,7 +89,9 @@ def refused(before, after, judged, largest_error=0.01, **change):
     problem.largest_error = largest_error
     given = {'converged': True, 'parameters': (), 'chance': None, 'region': 1, 'surprise': 0.0}
     judging = Comparison(*parts, judged)
-    result = SimpleNamespace(step=None, not_excited=(), validation=judging, **given | change)
+    known = {'step': None, 'not_excited': (), 'outliers': (), 'validation': judging}
+    known['noise'] = SimpleNamespace(position=1.0)
+    result = SimpleNamespace(**known | given | change)
     return [*refusals(problem, result, None, False, True)]
 
 

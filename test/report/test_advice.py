@@ -257,7 +257,7 @@ def test_what_two_rules_ask_for_is_told_once():
     both = (Rule.LARGEST_ERROR, Rule.OUTLIERS)
     first, second = advice.advice([Reason(rule, rule.name) for rule in both])
     assert first.steps == refusals.rules()[Rule.LARGEST_ERROR].steps
-    assert second.steps == refusals.rules()[Rule.OUTLIERS].steps[:2]
+    assert second.steps == refusals.rules()[Rule.OUTLIERS].steps[:3]
 
 
 def test_a_refused_page_says_why_and_what_to_do():
