@@ -19,7 +19,7 @@ from calib_ros.values import LARGEST
 
 AT = ' at'  # no attribute has such a name
 _DOCTYPE = re.compile(r'<!DOCTYPE|<!ENTITY', re.IGNORECASE)
-_NOT_READ = re.compile(rb'<\?.*?(?:\?>|\Z)|<!--.*?(?:-->|\Z)', re.DOTALL)
+_NOT_READ = re.compile(rb'(?s)<(?:\?.*?(?:\?>|\Z)|!--.*?(?:-->|\Z)|!\[CDATA\[.*?(?:]]>|\Z))')
 
 
 def robot_of(text: str) -> ET.Element:

@@ -229,6 +229,7 @@ def test_what_ros_reads_is_read():
     longer = chain.with_offsets({'elbow_joint.d': 1e-3})
     edits = corrected_urdf(noted, longer).replace('drake:note="0" ', '')
     assert edits == corrected_urdf(UR10E, longer)
+    chain_from_urdf(edited(UR10E, '</robot>', '<![CDATA[ <!-- ]]></robot>'))  # all of it
     head = '\n<!-- Größe -- a & b --><?xml version="1.0" encoding="latin-1"?>\n'
     assert corrected_urdf(head + UR10E, longer) == head + corrected_urdf(UR10E, longer)
 
