@@ -34,7 +34,7 @@ def read_lens(path: Path, found: Detections | None = None, fitted: bool = False)
     if not isinstance(content, dict):
         raise ConfigError(f'{path} must be a mapping, as camera_calibration writes it')
     for key in content:
-        if re.search('dist|coef|^[kp][1-6]$', str(key).lower()) and key not in DISTORTION:
+        if re.search('^dist|distor|coef|^[kp][1-6]$', str(key).lower()) and key not in DISTORTION:
             raise ConfigError(f'{path}: unknown key "{key}": call it {DISTORTION[1]}')
     if found is not None:
         _require_size(path, content, found)

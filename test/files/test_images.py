@@ -372,7 +372,7 @@ MATRIX = 'k: [800, 0, 320, 0, 800, 240, 0, 0, 1]'
 )
 def test_intrinsics_that_are_none_are_refused(tmp_path, text, said):
     path = tmp_path / 'camera.yaml'
-    path.write_text(MATRIX)
+    path.write_text(f'{MATRIX}\nworking_distance: 0.4')
     assert lenses.read_lens(path) == Lens(800.0, 800.0, 320.0, 240.0)
     path.write_text(text)
     with pytest.raises(ConfigError, match=said):
