@@ -4,14 +4,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy import special
 
 from calib_ros.annotated import Count, NotNegative, Share, as_annotated
-from calib_ros.decision.comparison import Comparison, GroupVerdict
+from calib_ros.decision.comparison import Comparison, GroupVerdict, compare
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.moved import FROM_THERE, Step
 from calib_ros.decision.reasons import Reason
@@ -108,6 +108,16 @@ class Identification(Shown):
     def comparison(self) -> Comparison:
         """Return the residuals of the held-out pairs, or of the fitted ones if there are none."""
         return self.validation or self.fitted
+
+    @property
+    def lateness(self) -> float:
+        """Return the RMS error [mm] that jitter of stamps explains, which no figure holds."""
+        if all(each.punctual is None for each in self.problem.sets):
+            return 0.0
+        late = [replace(each, punctual=None) for each in self.problem.sets]
+        whole = compare(self.before, self.chain, late, self.fitted.judged).figures[1]
+        left = whole.rms_mm**2 - self.fitted.figures[1].rms_mm ** 2
+        return float(np.sqrt(max(left, 0.0)))
 
     @property
     def contradiction(self) -> str:

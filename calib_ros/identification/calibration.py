@@ -105,9 +105,8 @@ class Calibration(Shown):
 
         `verify` recognises the `fitted` ones, and cannot pass on them.
         """
-        before, after = result.comparison.figures
-        region, noise, owners = result.region, result.noise, owners or {}
-        rms_mm = round(after.rms_mm, 6)  # as in the file
+        late, region, noise, owners = result.lateness, result.region, result.noise, owners or {}
+        rms_mm = [round(float(np.hypot(x.rms_mm, late)), 6) for x in result.comparison.figures]
         record = {
             **provenance(),
             'measured': recorded_time(fitted),
@@ -116,8 +115,8 @@ class Calibration(Shown):
             'samples': len(result.fitted.judged),
             'outliers': len(result.outliers),
             'validated_by': result.validated_by,
-            'rms_mm_before': round(before.rms_mm, 6),
-            'rms_mm_after': rms_mm,
+            'rms_mm_before': rms_mm[0],
+            'rms_mm_after': rms_mm[1],
             'noise_in_sigma': asdict(noise) | {'shared': list(noise.shared)},
             'not_identifiable': list(result.unidentifiable),
             **about(result.chain, result.before, region),
@@ -132,7 +131,7 @@ class Calibration(Shown):
             covariance=result.covariance,
             unmodelled=result.posterior.unmodelled,
             freedom=result.uncertainty.overall,
-            residual=1e-3 * rms_mm,
+            residual=1e-3 * rms_mm[1],  # as in the file
             noise=noise,
             region=region,
             world_frame=result.problem.world_frame,

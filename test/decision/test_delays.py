@@ -13,6 +13,7 @@ from calib_ros.decision.comparison import compare
 from calib_ros.decision.delays import other_delay, timed, uneven
 from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.fitting import fit
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics.effects import members
 from calib_ros.kinematics.se3 import exp_rotation
@@ -127,6 +128,10 @@ def test_an_arm_is_judged_by_what_jitter_does_not_explain(oriented, errors):
         result = identify(Problem(UR10E, fitted, held_out, **SIGMAS))
         assert result.accepted is (errors > 0.0)
         assert result.validation.figures[1].rms_mm < 2e3 * SIGMAS['sigma_position']
+        recorded = Calibration.of(result)  # `verify` sees new poses that are late, too
+        raw = compare(result.before, result.chain, [seen]).figures[1].rms_mm
+        assert 1e3 * recorded.residual == pytest.approx(raw, rel=0.2)
+        assert recorded.record['rms_mm_after'] == 1e3 * recorded.residual
 
 
 def test_nominal_arms_are_not_late_for_their_errors():
