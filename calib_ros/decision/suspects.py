@@ -110,8 +110,8 @@ def _arm_mistakes(chain: Chain, sets: Sets) -> Iterator[Suspect]:
     yield from _of_arms(chain)
     yield from _of_frames(chain, sets)
     for rows in (1, -1, 2, -2):
-        what, published = rows_away(rows), 'check the stamps, and delay'
-        yield Suspect(what, f'--shift {rows}', rank=2, rows=rows, published=published)
+        remedy, published = f'--shift {rows} (added to one given)', 'check the stamps, and delay'
+        yield Suspect(rows_away(rows), remedy, rank=2, rows=rows, published=published)
 
 
 def rows_away(rows: int) -> str:

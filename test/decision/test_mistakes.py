@@ -113,7 +113,7 @@ SPOILT = {
     'swapped': (joints(lambda q: q[:, [0, 1, 2, 4, 3, 5]]), 'q4=q5,q5=q4'),
     'reversed': (joints(lambda q: q[:, ::-1]), '--columns q1=q6,q2=q5,q3=q4,q4=q3,q5=q2,q6=q1'),
     'coupled': (joints(lambda q: q @ COUPLED.T), 'q3=q3-q2'),
-    'shift': (later, '--shift -1'),
+    'shift': (later, '--shift -1 (added to one given)'),
 }
 
 
