@@ -382,8 +382,9 @@ def _by_numbers(table: _Table, log: _Table) -> tuple[str, Index]:
                 'these columns out'
             )
         skip = np.ptp(np.array(numbers, float)) >= len(numbers) == len({*numbers})
-        if skip and {*numbers} <= {*logged} and len({*logged}) == len(logged):
-            return name, np.array([logged.index(number) for number in numbers])
+        rows = {number: row for row, number in enumerate(logged)}
+        if skip and rows.keys() >= {*numbers} and len(rows) == len(logged):
+            return name, np.array([rows[number] for number in numbers])
     return '', np.arange(log.count)
 
 
