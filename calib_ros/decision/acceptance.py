@@ -28,6 +28,7 @@ from calib_ros.estimation.posterior import Posterior
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.trimmed import most_left_out
 from calib_ros.kinematics import effects
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.settings import EXCEPTION
 from calib_ros.shown import some
 
@@ -158,17 +159,16 @@ def _idle_joints(problem: Problem) -> str:
 
 
 def oddities(
-    problem: Problem, posterior: Posterior, step: Step | None, coarse: Mapping[str, float]
+    problem: Problem, posterior: Posterior, step: Step | None, coarse: Mapping[Parameter, float]
 ) -> tuple[str, ...]:
     """Return what is suspicious about a result but no reason to refuse it.
 
     `coarse` holds the steps [rad or m] of rounded joint values.
     """
     found = [] if step is None or step.harmful else [str(step)]
-    units = {joint.name: joint.driven.unit for joint in problem.chain.joints}
     steps: dict[str, list[str]] = {}
     for name, size in coarse.items():
-        steps.setdefault(resolution_in_words(size, units[name]), []).append(name)
+        steps.setdefault(resolution_in_words(size, name.unit), []).append(name.owner)
     if steps:
         each = [f'{step} ({", ".join(names)})' for step, names in steps.items()]
         found.append(f'joint values are multiples of {", ".join(each)}: record more digits')

@@ -21,6 +21,7 @@ from calib_ros.estimation.system import row_samples, stacked
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import TWO_TURNS
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.values import ROUNDED, SAME
 
@@ -31,8 +32,8 @@ RESOLUTIONS = (
 """Steps [rad or m] that values are rounded to; finer ones do no harm, wider ones are intended."""
 
 
-def rounded_joints(problem: Problem) -> dict[str, float]:
-    """Return the joints whose values are multiples of a step [rad or m], with the step.
+def rounded_joints(problem: Problem) -> dict[Parameter, float]:
+    """Return the zeros of joints whose values are multiples of a step [rad or m], with the step.
 
     A few values may be multiples of a wider step by chance, and two tell none: then that of other
     joints, or of all together, counts. None if some are hardly rad or m: the steps are of another
@@ -43,24 +44,24 @@ def rounded_joints(problem: Problem) -> dict[str, float]:
         return {}
     own = [resolution_of(q) for q in joints.T]
     steps, found = sorted({*own, resolution_of(joints.ravel())} - {0.0}), {}
-    for joint, step, q in zip(problem.chain.joint_names, own, joints.T, strict=True):
+    for joint, step, q in zip(problem.chain.joints, own, joints.T, strict=True):
         count = len(np.unique(q))
         by_chance = (s for s in steps if (s / (step or s)) ** count > 1.0 - CERTAIN)
         likely = [s for s in by_chance if count > 1 and _are_multiples(q, s)]
         if likely:
-            found[joint] = likely[0]
+            found[joint.driven] = likely[0]
     return found
 
 
-def lost_digits(problem: Problem, chain: Chain) -> dict[str, float]:
-    """Return the joints whose values have lost all decimals, with the step [rad or m].
+def lost_digits(problem: Problem, chain: Chain) -> dict[Parameter, float]:
+    """Return the zeros of joints whose values have lost all decimals, with the step [rad or m].
 
     Poses may be meant to be at whole degrees: most residuals of the fitted chain must be turns of
     the joint, as large as those by rounding. By chance half of those in images are, and distances
     always.
     """
     sets = [each.spread() for each in problem.sets if each.distances is None]
-    found = dict[str, float]()
+    found = dict[Parameter, float]()
     if not sets:
         return found
     joints = np.concatenate([each.joints for each in sets]).T
@@ -73,16 +74,15 @@ def lost_digits(problem: Problem, chain: Chain) -> dict[str, float]:
                 column, left = np.maximum(squares, 1e-300)
                 turned = np.median(np.abs(along) / column) > step / 8.0  # by rounding: a quarter
                 if turned and np.median(along**2 / (column * left)) > 0.75:
-                    found[joint.name] = step
+                    found[joint.driven] = step
     return found
 
 
 def with_lost_digits(
-    refused: tuple[Reason, ...], lost: Mapping[str, float], chain: Chain
+    refused: tuple[Reason, ...], lost: Mapping[Parameter, float]
 ) -> tuple[Reason, ...]:
     """Return the refusals, if any, after the joints that have only whole steps [rad or m] left."""
-    units = {joint.name: joint.driven.unit for joint in chain.joints}
-    each = [f'{name} ({resolution_in_words(size, units[name])})' for name, size in lost.items()]
+    each = [f'{n.owner} ({resolution_in_words(size, n.unit)})' for n, size in lost.items()]
     text = (
         f'most errors of the poses are those of {", ".join(each)}, whose values have lost their '
         'decimals: record all digits'
@@ -97,19 +97,18 @@ def resolution_in_words(step: float, unit: str) -> str:
     return f'{degrees:g}°' if written else f'{1e3 * step:.3g} m{unit}'
 
 
-def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, float]:
+def rounding_errors(problem: Problem, coarse: Mapping[Parameter, float]) -> dict[str, float]:
     """Return the error [rad or m] of each joint's zero by rounding, by parameter.
 
     The RMS of the mean over all values, uniform within a step; a value shared by most poses hardly
     averages out.
     """
     joints = np.concatenate([each.joints for each in problem.sets])
-    found: dict[str, float] = {}
+    found = dict[str, float]()
     for joint, values in zip(problem.chain.joints, joints.T, strict=True):
-        if joint.name in coarse:
+        if joint.driven in coarse:
             shares = np.unique(values, return_counts=True)[1] / len(values)
-            size = coarse[joint.name] / np.sqrt(12.0) * np.sqrt(np.sum(shares**2))
-            found[joint.driven] = float(size)
+            found[joint.driven] = coarse[joint.driven] * float(np.sqrt(np.sum(shares**2) / 12.0))
     return found
 
 
@@ -117,7 +116,7 @@ def error_by_rounding(problem: Problem, chain: Chain) -> float:
     """Return the RMS position error [m] of the fitted flange that rounded joint values cause."""
     joints, squares = np.concatenate([each.spread().joints for each in problem.sets]), 0.0
     for name, step in (rounded_joints(problem) | lost_digits(problem, chain)).items():
-        moved = joints + step * (np.array(chain.joint_names) == name)
+        moved = joints + step * (np.array(chain.joint_names) == name.owner)
         shift = (chain.forward(moved) - chain.forward(joints))[:, :3, 3]
         squares += float(np.mean(np.sum(shift**2, axis=-1))) / 12.0
     return float(np.sqrt(squares))
@@ -138,7 +137,7 @@ def _are_multiples(values: FloatArray, step: float) -> bool:
     return bool(np.abs(values / step - np.round(values / step)).max() < ROUNDED)
 
 
-def may_be_rounding(fitted: Fitted, before: Chain, coarse: Mapping[str, float]) -> bool:
+def may_be_rounding(fitted: Fitted, before: Chain, coarse: Mapping[Parameter, float]) -> bool:
     """Tell whether rounding moves the arm by half of the correction or more, over the joint range.
 
     A fit follows the rounding of values that repeat, and so do poses left out of it; what it can
@@ -148,7 +147,7 @@ def may_be_rounding(fitted: Fitted, before: Chain, coarse: Mapping[str, float]) 
     if not coarse:
         return False
     chain, names = fitted.chain, fitted.names
-    sets = [each.spread() for each in fitted.good_sets()]
+    sets = fitted.good_sets()
     wanted = list(dict.fromkeys([*names, *(joint.driven for joint in chain.joints)]))
     parts = fitted.problem.system(sets).rows_of(chain, wanted)
     rows, owner = stacked(parts), row_samples(parts)
@@ -158,8 +157,8 @@ def may_be_rounding(fitted: Fitted, before: Chain, coarse: Mapping[str, float]) 
     values = np.concatenate([each.joints for each in sets]).T
     for joint, q in zip(chain.joints, values, strict=True):
         _, level, count = np.unique(q, return_inverse=True, return_counts=True)
-        if joint.name in coarse:
-            step = coarse[joint.name] * (count > 1)[level[owner], np.newaxis]
+        if joint.driven in coarse:
+            step = coarse[joint.driven] * (count > 1)[level[owner], np.newaxis]
             column = rows[:, [wanted.index(joint.driven)]] * step / np.sqrt(12.0)
             along = np.zeros((len(count), len(names)))
             np.add.at(along, level[owner], own * column)

@@ -141,7 +141,7 @@ def _identified(
     )
     own = None if step and not step.slow else arms_own(fitted)
     verdicts = own, may_be_rounding(fitted, before.chain, coarse), fitted.held is None, scaled
-    refused = with_lost_digits(refusals(problem, result, *verdicts), lost, chain)
+    refused = with_lost_digits(refusals(problem, result, *verdicts), lost)
     result = replace(result, refusals=wrong + refused)
     named = mistakes.with_mistake(problem, result)
     return plausibility.add_remarks(problem, named, another=named is result)

@@ -172,7 +172,7 @@ def test_what_rounding_gives_to_the_zero_of_a_joint(step, rng):
     q[7, 4] = 45.0  # as in degrees
     assert rounded_joints(Problem(UR10E, measure(UR10E, q, rng))) == {}
     steps = rounded_joints(problem)
-    assert list(steps) == [*UR10E.joint_names[:4]]
+    assert list(steps) == [joint.driven for joint in UR10E.joints[:4]]
     assert {*steps.values()} == {step}
     one = step / np.sqrt(12.0)
     assert rounding_errors(problem, steps) == pytest.approx(
@@ -196,7 +196,8 @@ def test_two_values_of_each_joint_tell_a_step_together(step, rng):
         q = levels[np.arange(6), which]
         q = step * np.round(q / step) if told else q  # else multiples of 30 degrees
         found = rounded_joints(Problem(UR10E, measure(UR10E, q, rng)))
-        assert found == (dict.fromkeys(UR10E.joint_names, step) if told else {})
+        zeros = [joint.driven for joint in UR10E.joints]
+        assert found == (dict.fromkeys(zeros, step) if told else {})
 
 
 @pytest.mark.parametrize('step', [np.deg2rad(1.0), 0.1])
@@ -209,7 +210,7 @@ def test_a_joint_that_lost_its_decimals_is_told_first(step, rng):
     lost = np.where(np.arange(6) == 1, meant, q)
     problem = Problem(UR10E, replace(measure(true, q, rng, 1e-4, 3e-4), joints=lost))
     assert lost_digits(right, true) == {}  # whole degrees of all joints, and they are reached
-    assert lost_digits(problem, true) == {'shoulder_lift_joint': pytest.approx(step)}
+    assert lost_digits(problem, true) == {'shoulder_lift_joint.theta': pytest.approx(step)}
     first = identify(problem).refusals[0]
     assert first.rule is Rule.MISTAKE
     assert first.startswith('most errors of the poses are those of shoulder_lift_joint (1')
@@ -277,7 +278,7 @@ def test_how_far_rounding_moves_an_arm(seed, shared, monkeypatch):
     monkeypatch.setattr(special, 'chdtri', lambda *_: 1e-12)  # the rest may be rounding
     half = 0.5 * np.sqrt(np.mean(np.sum(corrected**2, axis=1))) / moved
     for step, told in ((0.9 * half, False), (1.1 * half, True)):
-        assert rounding.may_be_rounding(fitted, before, {'elbow_joint': step}) == told
+        assert rounding.may_be_rounding(fitted, before, {driven: step}) == told
     assert not rounding.may_be_rounding(fitted, before, {})
 
 
