@@ -89,15 +89,13 @@ def _fold_count(problem: Problem, names: Sequence[str], count: int, rows: int) -
     """Return the number of folds; 0 if all configurations are needed for the fit.
 
     The other folds must determine the fit, with some equations to spare. If they do so only with
-    priors, one configuration is left out at a time.
+    priors tighter than common sense, one configuration is left out at a time.
     """
-    known = dict(problem.model.effects)
+    known, given = dict(problem.model.effects), problem.given
     names = [name for name in names if name not in known]  # effects have priors
     folds = min(problem.folds, count)
     if folds > 1 and rows * (folds - 1) // folds >= len(names) + TELLING:
         return folds
-    folds = count
-    unknown = set(names) - problem.informed
-    if len(unknown) == len(names) or rows * (folds - 1) // folds < len(unknown) + TELLING:
-        return 0
-    return folds
+    free = sum(given.get(name, np.inf) >= problem.common_sense(name) for name in names)
+    enough = free < len(names) and rows * (count - 1) // count >= free + TELLING
+    return count if enough else 0

@@ -250,12 +250,6 @@ class Problem(Shown):
                 sigmas[name] = fits[0]
         return sigmas
 
-    @cached_property
-    def informed(self) -> frozenset[str]:
-        """Return the DH parameters whose prior is tighter than common sense."""
-        known = {n for n, sigma in self.given.items() if sigma < self.common_sense(n)}
-        return frozenset(known - dict(self.model.effects).keys())
-
     def common_sense(self, name: str) -> float:
         """Return a third of the largest offset [m, rad] of a faulty robot."""
         return (self.largest_length if Parameter(name).is_length else self.largest_angle) / 3.0

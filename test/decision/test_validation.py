@@ -277,7 +277,8 @@ def test_folds_leave_enough_to_fit_and_some_to_spare(count, rows, names, known, 
     problem = SimpleNamespace(
         model=SimpleNamespace(effects=(('elbow_joint.ratio', 0.0),)),
         folds=5,
-        informed=frozenset(f'p{k}' for k in range(known)),
+        given={f'p{k}': 0.5 for k in range(known)},
+        common_sense=lambda name: 1.0,
     )
     every = [*(f'p{k}' for k in range(names)), 'elbow_joint.ratio']
     assert cross_validation._fold_count(problem, every, count, rows) == wanted
