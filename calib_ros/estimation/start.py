@@ -132,7 +132,7 @@ def _start_one(
     if not names:
         return chain
     if observations.socket:
-        return next(closed_forms(chain, observations))
+        return next(next(_starts(chain, observations)))
     subset = observations.spread()
     system = System((Samples(subset, *sigmas),))
     if subset.of_wire:
@@ -161,7 +161,7 @@ def _start_one(
 
 
 def _starts(chain: Chain, observations: Observations) -> Iterator[Iterator[Chain]]:
-    """Yield starts to polish, then further ones if none of those is good."""
+    """Yield starts to polish in closed form, then further ones if none of those is good."""
     arm = flange(chain, observations)
     if observations.plane:
         yield _on_plane(chain, arm, observations)
@@ -204,11 +204,6 @@ def fit_to_arm(
     fitted = minimise(chain, independent, system, iterations=iterations).chain
     left = fitted.forward(joints)[:, :3, 3] - seen.positions
     return fitted, float(np.sqrt((left**2).sum(axis=1).mean()))
-
-
-def closed_forms(chain: Chain, observations: Observations) -> Iterator[Chain]:
-    """Yield the chain with base and tool for poses, positions or a socket, in closed form."""
-    return _each(chain, closed_frames(chain, observations, flange(chain, observations)))
 
 
 def closed_frames(chain: Chain, observations: Observations, arm: FloatArray) -> FloatArray:
