@@ -52,12 +52,10 @@ def strain_of(fitted: Fitted) -> tuple[str, float]:
     rows = stacked(list(map(_with_strains, system.rows_of(chain, columns), strained)))
     free = [*range(len(names)), *(k for k, n in enumerate(columns) if n in travels(chain))]
     given, back = system.extra_rows(chain, columns)
+    known = np.column_stack([given, np.zeros((len(given), len(STRAINS))), back])
     sane = [1.0 / OUT_OF_SCALE] * len(STRAINS)  # else, beside linear joints, that of noise
-    usual = np.diag([0.0] * len(names) + [1.0 / size for size in more.values()] + sane)
-    known = np.zeros((len(given) + len(usual), rows.shape[1]))
-    known[: len(given), :count], known[: len(given), -1] = given, back
-    known[len(given) :, :-1] = usual
-    text = _in_words(np.vstack([rows, known]), count)
+    usual = [0.0] * len(names) + [1.0 / size for size in more.values()] + sane
+    text = _in_words(np.vstack([rows, known, np.diag([*usual, 0.0])]), count)
     free += range(count, rows.shape[1]) if text else [rows.shape[1] - 1]
     share = gain_share(rows[:, [*dict.fromkeys(free)]], len(names))
     return text, share if EXPLAINED < share < 1.0 and not held else 0.0

@@ -189,23 +189,18 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
 
     Only if all poses have an orientation, a camera on the flange may have measured them.
     """
-    ways = [
-        Suspect(
-            'the quaternions are w x y z, not x y z w',
-            '--quaternion wxyz',
-            (map_rotations(lambda turns: se3.from_quat(np.roll(se3.to_quat(turns), -1, 1))),),
-        ),
-        Suspect(
-            'the quaternions are x y z w, not w x y z',
-            '--quaternion xyzw',
-            (map_rotations(lambda turns: se3.from_quat(np.roll(se3.to_quat(turns), 1, 1))),),
-        ),
-        Suspect(
-            'the rotations are transposed: they are of the device in the target',
-            '--columns qx=-qx,qy=-qy,qz=-qz',
-            (map_rotations(lambda turns: np.swapaxes(turns, 1, 2)),),
-        ),
-    ]
+
+    def rolled(turns: FloatArray, by: int) -> FloatArray:
+        return se3.from_quat(np.roll(se3.to_quat(turns), by, 1))
+
+    ways = []
+    for meant, read, by in (('w x y z', 'x y z w', -1), ('x y z w', 'w x y z', 1)):
+        what, option = f'the quaternions are {meant}, not {read}', meant.replace(' ', '')
+        changes = (map_rotations(partial(rolled, by=by)),)
+        ways.append(Suspect(what, f'--quaternion {option}', changes))
+    what = 'the rotations are transposed: they are of the device in the target'
+    transposed = map_rotations(lambda turns: np.swapaxes(turns, 1, 2))
+    ways.append(Suspect(what, '--columns qx=-qx,qy=-qy,qz=-qz', (transposed,)))
     if seen.inverse:
         what = 'the poses are not of a fixed target seen from the flange'
         ways.append(Suspect(what, NOT_ON_FLANGE[1], BACK, published=_in_sources(False)))
