@@ -26,7 +26,7 @@ from calib_ros.errors import CalibrationError
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import SOME, fit
 from calib_ros.estimation.gain import gain_share
-from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING
+from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples
@@ -36,7 +36,7 @@ from calib_ros.estimation.weights import weights_of
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.joint import small_units
 from calib_ros.kinematics.parameter import DELAY, Parameter
-from calib_ros.kinematics.se3 import FloatArray, norms
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray, norms
 from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.shown import two_digits
 
@@ -117,8 +117,8 @@ def _without_drift(given: Problem, bases: Sequence[str]) -> tuple[Problem, list[
             rows[k] = np.concatenate([rows[k][:count], added, rows[k][-1:]])
         matrix, poses = stacked(rows), sum(each.shape[-1] for each in rows)
         share = gain_share(matrix, count)  # late poses have all their errors together
-        halves = 0.5 * (poses - len(sizes)), 0.5 * len(sizes)
-        chance = special.betainc(*halves, max(1.0 - share, 0.0))
+        free = poses - len(sizes)
+        chance = chance_of(share / max(1.0 - share, ROUNDING) * free, len(sizes), free)
         if not (share > EXCEPTION and chance < 1.0 - SURE and _lacking(fitted)):
             break
         sizes += np.linalg.lstsq(matrix[:, :-1], matrix[:, -1])[0][count:]
