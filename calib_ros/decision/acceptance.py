@@ -72,7 +72,7 @@ def refusals(
 def _hidden_outliers(problem: Problem, result: Identification) -> str:
     """Return that as many gross errors were found as can be, and the rest does not fit either.
 
-    A stop measured again tells them itself, and so do the corners of an image.
+    Those of a repeated stop, or of corners in an image, show without the others.
     """
     found, size = 0, result.noise.position
     if not result.outliers or size <= 1.0 / NEARER:

@@ -48,8 +48,8 @@ class Comparison(Shown):
 
     Before is the nominal chain with fitted base and tool frames, so that the gain is the arm's.
     `judged` (N,) is False for outliers; `repeated` (N,) is True for held-out pairs at fitted
-    configurations, which count nowhere. If the device drifts, so many pairs as are `together` tell
-    as much as one. A configuration is one of the `kind`: poses, stations or locations.
+    configurations, which count nowhere. If the device drifts, `together` pairs tell as much as
+    one. Configurations are of the `kind` poses, stations or locations.
     """
 
     before: Residuals
@@ -112,10 +112,7 @@ def compare(
     judged: Flags | None = None,
     together: float = 1.0,
 ) -> Comparison:
-    """Return the residuals of all sets by both chains; `judged` (N,) is False for outliers.
-
-    If the device drifts, so many pairs as are `together` tell as much as one.
-    """
+    """Return the residuals of all sets by both chains, with `judged` (N,) and `together`."""
     numbers = np.concatenate(numbered(sets))
     last, first = (  # `after` first: cached after a fit
         joined([residuals(chain, each) for each in sets], numbers) for chain in (after, before)

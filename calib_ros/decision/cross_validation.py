@@ -28,7 +28,7 @@ def cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Comparison
     """Judge both chains on folds of configurations that were not fitted; None if too few.
 
     Between few stations an arm imitates a moved device: all poses of one are in the same fold.
-    A `note` (why not by held-out pairs) stands behind the text.
+    A `note`, why not by held-out pairs, ends the text.
     """
     problem, names, system = fitted.problem, fitted.names, fitted.system
     rows = sum(

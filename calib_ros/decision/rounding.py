@@ -35,9 +35,8 @@ RESOLUTIONS = (
 def rounded_joints(problem: Problem) -> dict[Parameter, float]:
     """Return the zeros of joints whose values are multiples of a step [rad or m], with the step.
 
-    A few values may be multiples of a wider step by chance, and two tell none: then that of other
-    joints, or of all together, counts. None if some are hardly rad or m: the steps are of another
-    unit.
+    Few values may be multiples of a wider step by chance, and two tell no step: then that of other
+    joints, or of all together, counts. None if some values are in another unit than rad or m.
     """
     joints = np.concatenate([each.joints for each in problem.sets])
     if np.abs(joints).max() > TWO_TURNS:
@@ -56,9 +55,8 @@ def rounded_joints(problem: Problem) -> dict[Parameter, float]:
 def lost_digits(problem: Problem, chain: Chain) -> dict[Parameter, float]:
     """Return the zeros of joints whose values have lost all decimals, with the step [rad or m].
 
-    Poses may be meant to be at whole degrees: most residuals of the fitted chain must be turns of
-    the joint, as large as those by rounding. By chance half of those in images are, and distances
-    always.
+    Whole degrees may be intended, so most residuals of the fitted chain must be turns of the joint
+    as large as rounding causes. Half of those in images are by chance, those of distances always.
     """
     sets = [each.spread() for each in problem.sets if each.distances is None]
     found = dict[Parameter, float]()

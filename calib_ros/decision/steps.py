@@ -54,8 +54,8 @@ EXPLAINED = 0.5
 def find_step(fitted: Fitted) -> Step | None:
     """Return the step that explains more than half of the residuals of a fit, if any.
 
-    Or several of one thing, each of what the others leave. Of those beside a load from the first
-    pose on, if that alone explains more than they do.
+    Or several steps of one thing, each of which explains as much of what the others leave. A load
+    from the first pose on is fitted as well if it alone explains more than they do.
     """
     scan, found = _searched(fitted, loaded=False)
     quiet = fitted.noise.position < SUSPICIOUS
@@ -307,9 +307,9 @@ def _drifts(scan: Scan, found: _Found) -> bool:
 
 
 def _described(scan: Scan, found: _Found, quiet: bool) -> Step | None:
-    """Return a step, and later ones of the same group; no far slow motion.
+    """Return a step with later ones of the same group, or None for a large slow motion.
 
-    Without gross errors the residuals are `quiet`, if all that remain are from one place.
+    Residuals without gross errors are `quiet` if all samples kept are from one place.
     """
     steps = [_step_of(scan, found, k) for k in range(len(found.stops))]
     first, last = steps[0], steps[-1]
@@ -321,7 +321,7 @@ def _described(scan: Scan, found: _Found, quiet: bool) -> Step | None:
 
 
 def _step_of(scan: Scan, found: _Found, number: int) -> Step | None:
-    """Return one of the steps, with its first sample and its effect, but no far slow motion."""
+    """Return one of the steps with its first sample and effect; None for a large slow motion."""
     group, problem = found.group, scan.problem
     place, offsets = found.stops[number], found.sizes[number]
     sets = [scan.sets[k] for k in group.sets]

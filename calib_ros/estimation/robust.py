@@ -77,11 +77,11 @@ def reweighted(
 ) -> Robust:
     """Fit with the weights of a loss, from a start that is good enough to detect gross errors.
 
-    Fits are repeated to a `tolerance` until the weights converge: the more often they swing, the
-    smaller their steps, lest they go round for ever. A sample at the edge may lose weight, come
-    nearer, regain it, and so on. Weights that creep take the step of the secant. With the
-    distances (N,) of all samples by a `simpler` model, samples that it explains are no gross
-    errors: a richer model has to explain them too.
+    Fits are repeated to a `tolerance` until the weights converge. A sample at the edge may lose
+    weight, come nearer, regain it, and so on: the more often weights swing, the smaller their
+    steps. Weights that creep take the step of the secant. With the distances (N,) of all samples
+    by a `simpler` model, samples that it explains are no gross errors: a richer model has to
+    explain them too.
     """
     ends = system.ends
 
