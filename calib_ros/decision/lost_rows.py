@@ -128,16 +128,15 @@ def computed_rows(problem: Problem) -> str:
         return ''
     rows, arm = np.arange(len(seen)), replace(problem.chain, base=None, tool=None, frames=())
     third = len(seen) // 3
-    alone = seen.changed(base='base', tool='tool')
     least = NEARER * np.ptp(seen.joints, axis=0)
     for parts in (rows < third, rows >= len(seen) - third), (rows % 2 == 0, rows % 2 == 1):
-        some = [each for each in map(alone.select, parts) if covers(each, least)]
+        some = [each for each in map(seen.select, parts) if covers(each, least)]
         trials = [in_frames(problem, arm, (each,)) for each in some]
         found = sorted(trials, key=lambda one: one.error)
         if len(found) < 2 or found[1].error > fault_limit(problem):
             continue
         if found[0].error < EXCEPTION**2 * found[1].error:
-            away = sample_errors(found[0].chain, alone, flange(found[0].chain, alone))
+            away = sample_errors(found[0].chain, seen, flange(found[0].chain, seen))
             near = np.flatnonzero(away < EXCEPTION * found[1].error).tolist()
             ours, others = (two_digits(1e3 * each.error) for each in found[:2])
             return (

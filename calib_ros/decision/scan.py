@@ -28,6 +28,7 @@ from calib_ros.estimation.levels import LEAST_ASIDE, NEARER
 from calib_ros.estimation.pixels import in_view
 from calib_ros.estimation.samples import gram
 from calib_ros.estimation.system import System
+from calib_ros.estimation.visits import by_set
 from calib_ros.estimation.weights import OUTLIER, weights_of
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
@@ -139,7 +140,7 @@ class Scan:
         order = np.argsort(np.concatenate([each.stamps_ns for each in sets]), kind='stable')
         number = np.empty(len(order), dtype=np.intp)
         number[order] = stops(np.concatenate([each.joints for each in sets])[order])
-        self.numbers = np.split(number, np.cumsum([len(each) for each in sets])[:-1])
+        self.numbers = by_set(number, sets)
         self.stops = int(number.max(initial=-1)) + 1
         known = replace(few, separations=()).extra_rows(self.chain, fitted.names)
         extra = np.column_stack([np.pad(known[0], ((0, 0), (0, len(constant)))), known[1]])

@@ -213,10 +213,10 @@ def fits_each_side(problem: Problem, seen: Observations, stamp_ns: int) -> bool:
     if seen.pixels is not None or seen.distances is not None or seen.socket:
         return False
     arm = replace(problem.chain, base=None, tool=None, frames=())
-    alone, before = replace(seen, base='base', tool='tool'), seen.stamps_ns < stamp_ns
+    before = seen.stamps_ns < stamp_ns
     if min(np.count_nonzero(before), np.count_nonzero(~before)) < 2 * IN_A_FRAME:
         return False
-    sides = [in_frames(problem, arm, (alone.select(rows),)) for rows in (before, ~before)]
+    sides = [in_frames(problem, arm, (seen.select(rows),)) for rows in (before, ~before)]
     return all(side.error <= fault_limit(problem) for side in sides)
 
 

@@ -19,7 +19,7 @@ from calib_ros.estimation.levels import ALIKE, SURE
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.posterior import Posterior
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.visits import stations
+from calib_ros.estimation.visits import by_set, stations
 from calib_ros.estimation.weights import OUTLIER, distances_of
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -55,8 +55,7 @@ def _of_held_out(
     problem = fitted.problem
     if problem.loss != 'none':
         judged, new = ~comparison.counting, comparison.counting
-        ends = np.cumsum([len(each) for each in problem.judging])[:-1]
-        pairs = zip(problem.judging, np.split(new, ends), strict=True)
+        pairs = zip(problem.judging, by_set(new, problem.judging), strict=True)
         sets = [each.select(rows) for each, rows in pairs if rows.any()]
         far = distances_of(fitted.chain, fitted.names, problem.system(sets))
         judged[new] = np.concatenate(far) <= OUTLIER

@@ -29,7 +29,7 @@ def numbered(sets: Sequence[Observations]) -> tuple[Index, ...]:
     if len(sets) == 1:
         return (sets[0].configurations,)
     numbers = configurations(np.concatenate([each.joints for each in sets]))
-    return _split(numbers, sets)
+    return by_set(numbers, sets)
 
 
 def sided(sets: Sequence[Observations]) -> tuple[Observations, ...]:
@@ -44,7 +44,7 @@ def sided(sets: Sequence[Observations]) -> tuple[Observations, ...]:
     signs[order] = np.sign(np.take_along_axis(moves, np.maximum.accumulate(last), axis=0))
     return tuple(
         each if each.approach is not None and each.approach.any() else each.changed(approach=own)
-        for each, own in zip(sets, _split(signs, sets), strict=True)
+        for each, own in zip(sets, by_set(signs, sets), strict=True)
     )
 
 
@@ -66,7 +66,7 @@ def stations(sets: Sequence[Observations]) -> tuple[Index, ...]:
         numbers[near] = np.minimum(numbers[near], k)
     if TELLING in numbers or not numbers.any():
         return numbered(sets)
-    return _split(numbers, sets)
+    return by_set(numbers, sets)
 
 
 def _in_order(sets: Sequence[Observations]) -> tuple[FloatArray, Index]:
@@ -83,5 +83,6 @@ def _in_order(sets: Sequence[Observations]) -> tuple[FloatArray, Index]:
     return joints, order
 
 
-def _split(values: NDArray[S], sets: Sequence[Observations]) -> tuple[NDArray[S], ...]:
+def by_set(values: NDArray[S], sets: Sequence[Observations]) -> tuple[NDArray[S], ...]:
+    """Return the values (N,) of all pairs, set by set."""
     return tuple(np.split(values, np.cumsum([len(each) for each in sets])[:-1]))

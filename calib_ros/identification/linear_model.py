@@ -26,7 +26,7 @@ from calib_ros.estimation.posterior import size_group
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.samples import gram
 from calib_ros.estimation.system import row_samples, stacked
-from calib_ros.estimation.visits import numbered
+from calib_ros.estimation.visits import by_set, numbered
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
@@ -55,9 +55,9 @@ class LinearModel:
         self._sizes['drive'] = max(self._sizes.get(k, 0.0) for k in ('drive', 'coupling'))
         problem = replace(problem, learned=Learned(posterior.priors, self._noise))
         self._problem = problem
-        ends = np.cumsum([len(each) for each in problem.sets])
-        stride = max(1, -(-int(ends[-1]) // COMPARED))
-        pairs = zip(problem.sets, np.split(geometric.fitted.judged, ends[:-1]), strict=True)
+        judged = geometric.fitted.judged
+        stride = -(-len(judged) // COMPARED)
+        pairs = zip(problem.sets, by_set(judged, problem.sets), strict=True)
         sets = [each.select(np.flatnonzero(good)[::stride]) for each, good in pairs]
         self._system = problem.system(sets)
         numbers = numbered(sets)
