@@ -14,6 +14,7 @@ from calib_ros.apply.compensation import compensate
 from calib_ros.apply.compensator import Compensation, Compensator, Refusal
 from calib_ros.apply.refused import add_refusals, too_fast
 from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.estimation.visits import approaches
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index
 from calib_ros.progress import Notify, quiet
@@ -79,13 +80,6 @@ def compensate_program(
         ),
         result,
     )
-
-
-def approaches(positions: FloatArray) -> FloatArray:
-    """Return the sign (N, n) of the last move of each joint, 0 before the first."""
-    moves = np.sign(np.diff(positions, axis=0, prepend=positions[:1]))
-    last = np.where(moves != 0.0, np.arange(len(moves))[:, np.newaxis], 0)
-    return np.asarray(np.take_along_axis(moves, np.maximum.accumulate(last, axis=0), axis=0))
 
 
 def _derivatives(

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from calib_ros.apply.program import approaches
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.atomic import whole_folder, write_files
 from calib_ros.cli import checks, common, inputs
 from calib_ros.cli.identify import RESULT_FILES, identified, result_files, show
 from calib_ros.cli.screen import Screen
+from calib_ros.estimation.visits import approaches
 from calib_ros.files.loading import load_bag
 from calib_ros.files.recording import Recording, write_bag
 from calib_ros.kinematics.chain import Chain

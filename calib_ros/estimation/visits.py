@@ -38,14 +38,19 @@ def sided(sets: Sequence[Observations]) -> tuple[Observations, ...]:
     Joints come to their largest values from below: play so depends on them even in random order.
     """
     joints, order = _in_order(sets)
-    moves = np.diff(joints[order], axis=0, prepend=joints[order[:1]])
-    last = np.where(np.abs(moves) > STILL, np.arange(len(moves))[:, np.newaxis], 0)
     signs = np.empty_like(joints)
-    signs[order] = np.sign(np.take_along_axis(moves, np.maximum.accumulate(last), axis=0))
+    signs[order] = approaches(joints[order], STILL)
     return tuple(
         each if each.approach is not None and each.approach.any() else each.changed(approach=own)
         for each, own in zip(sets, by_set(signs, sets), strict=True)
     )
+
+
+def approaches(joints: FloatArray, least: float = 0.0) -> FloatArray:
+    """Return the sign (N, n) of the last move beyond `least` [rad or m], 0 before the first."""
+    moves = np.diff(joints, axis=0, prepend=joints[:1])
+    last = np.where(np.abs(moves) > least, np.arange(len(moves))[:, np.newaxis], 0)
+    return np.sign(np.take_along_axis(moves, np.maximum.accumulate(last), axis=0))
 
 
 def stations(sets: Sequence[Observations]) -> tuple[Index, ...]:

@@ -21,9 +21,9 @@ from hypothesis import given, strategies as st
 
 from calib_ros.apply.compensation import compensate, in_words
 from calib_ros.apply.compensator import Compensator
-from calib_ros.apply.program import approaches
 from calib_ros.apply.simulation import faulty
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.estimation.visits import approaches
 from calib_ros.kinematics import effects, follower
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.follower import mobility

@@ -8,9 +8,10 @@ from commanded import CELL, ROBOTS, UR, UR_TRUE, at_limit, missed, only_refusal,
 
 from calib_ros.apply.compensation import compensate
 from calib_ros.apply.compensator import Compensator
-from calib_ros.apply.program import Program, approaches, compensate_program
+from calib_ros.apply.program import Program, compensate_program
 from calib_ros.apply.simulation import faulty
 from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.estimation.visits import approaches
 
 
 @pytest.mark.parametrize('name', ['ur10e', 'kuka_iiwa14', 'kuka_youbot', 'ur10e_on_linear_axis'])
