@@ -159,9 +159,8 @@ def diagnose_alone(problem: Problem, chain: Chain) -> Diagnosis | None:
     sets = [each for each in problem.all_sets if each.distances is None and each.pixels is None]
     for each in sets:
         if found := _of_rows(problem, chain, each) or _of_repeats(problem, chain, each):
-            return _for_messages(
-                problem, replace(found, where=set_in_words(sets, each) + found.where)
-            )
+            where = set_in_words(sets, each) + found.where
+            return _for_messages(problem, replace(found, where=where))
     return None
 
 

@@ -225,13 +225,12 @@ def misfit_set(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
 
     Another device or session may have other units or conventions.
     """
-    trials = [in_frames(problem, chain, (each,)) for each in sets] if len(sets) > 1 else []
-    errors = np.array([trial.error for trial in trials])
-    wrong = np.flatnonzero(errors > fault_limit(problem)).tolist()
-    worst = max(wrong or range(len(sets)), key=lambda k: len(sets[k]))
-    if not 0 < len(wrong) < len(sets):
-        return (sets[worst],), ''
-    return (sets[worst],), set_in_words(sets, sets[worst])
+    if len(sets) == 1:
+        return sets, ''
+    most = fault_limit(problem)
+    wrong = [each for each in sets if in_frames(problem, chain, (each,)).error > most]
+    largest = max(wrong or sets, key=len)
+    return (largest,), set_in_words(sets, largest) if 0 < len(wrong) < len(sets) else ''
 
 
 def set_in_words(sets: Sequence[Observations], one: Observations) -> str:
