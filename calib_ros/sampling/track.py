@@ -210,20 +210,20 @@ class Track:
         return np.maximum(0, np.minimum(first, end - TELLING)), end
 
     def release(self, before_ns: int) -> int:
-        """Drop the samples before a stamp, after `sort`; return how many.
+        """Drop the samples before the last one up to a stamp, after `sort`; return how many.
 
-        The last one is kept, unless others name the joints of a publisher that has become silent.
+        That one is kept, unless others name the joints of a publisher that has become silent.
         """
         dropped = 0
         newest = self._newest()
         for columns, rows in tuple(self._parts.items()):
             index = list(columns)
-            cut = int(np.searchsorted(rows.stamps, before_ns))
-            if 0 < cut == rows.count and (newest[index] > rows.stamps[-1]).all():
+            last_ns = rows.stamps[-1]
+            if last_ns < before_ns and (newest[index] > last_ns).all():
                 del self._parts[columns]
-                dropped += cut
+                dropped += rows.count
                 continue
-            cut = min(cut, rows.count - 1)
+            cut = int(np.searchsorted(rows.stamps, before_ns, 'right')) - 1
             if cut <= 0:
                 continue
             cuts = np.array([cut])

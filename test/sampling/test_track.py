@@ -8,7 +8,7 @@ from hypothesis import given, strategies as st
 from tracked import BOTH, MAX_GAP, MS, add, at, came, causes, fill, filled, track
 
 from calib_ros.estimation.configurations import STILL
-from calib_ros.sampling.track import CAUSES
+from calib_ros.sampling.track import APART, CAUSES
 
 
 def words(made, *ms):
@@ -272,6 +272,12 @@ def test_release_keeps_the_last_sample_and_the_signs():
     np.testing.assert_array_equal(came(made, 90), [[1.0, -1.0]])
     made.release(500 * MS)
     assert made.horizon_ns == 1000 * MS
+
+
+def test_in_a_pause_joint_states_are_too_far_apart_whatever_was_let_go():
+    made = filled([(ms, (0.0, 0.0)) for ms in (*range(10), *range(900, 910))])
+    assert made.release(500 * MS) == 9
+    assert words(made, 5, 600, 905) == [CAUSES[1], APART, '']
 
 
 @pytest.mark.parametrize('capacity', [1, 2, 3, 4, 5, 100])
