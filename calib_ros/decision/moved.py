@@ -191,6 +191,8 @@ def thing_of(kind: str, seen: Observations, several: bool = False) -> str:
         device = ['the socket' if seen.socket else 'the plane']
     elif seen.distances is not None:
         device += ['its zero']
+    elif seen.moving:  # early or late is elsewhere
+        device += ['its clock']
     on_flange, other = (device, target) if seen.inverse or seen.on_flange else (target, device)
     other = [f'{other[0]}s'] if several else other
     *first, last = on_flange if kind == 'tool' else [*other, "the robot's foot"]

@@ -389,6 +389,7 @@ def test_a_joint_that_seldom_moves_is_told_if_it_moved_just_before_a_step(places
     [
         ({'socket': True}, 'the socket'),
         ({'distances': np.ones(3)}, 'the measuring device, its zero'),
+        ({'velocity': np.ones((3, 6))}, 'the measuring device, its clock'),
         ({'distances': np.zeros(3), 'plane': True}, 'the plane'),
     ],
 )
