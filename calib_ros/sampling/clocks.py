@@ -65,14 +65,16 @@ class Clocks:
             return self._seen
         return None if self._found is None or self._found.rivals else self._found
 
-    def wake(self, unrest: int, calm: int, taken: int) -> None:
-        """Watch again if more measurements at stops were not at rest.
+    def wake(self, unrest: int, calm: int, taken: int) -> bool:
+        """Watch again if more measurements at stops were not at rest; tell whether it begins.
 
         There were `calm` samples before the first of these, and `taken` by now.
         """
-        if unrest > self._unrest and not self._awake:
+        woken = unrest > self._unrest and not self._awake
+        if woken:
             self._awake, self._agreed, self._looked_ns = True, calm, 0
         self._unrest, self._taken = unrest, taken
+        return woken
 
     def take(self, pieces: Sequence[Piece]) -> None:
         """Watch joint values, and measured positions with the rotation if known."""

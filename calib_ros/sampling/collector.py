@@ -53,6 +53,7 @@ class Collector:
         self._sampled_ns = 0  # a stop at this moment has been sampled
         self._seated_ns = 0  # the ball was captured in a socket at this moment
         self._since_ns = 0  # begin of the stop that goes on
+        self._shaken_ns = 0  # end of the first stop of the last rounds that was not at rest
         self.rests = Rests(settings.pose_buffer)
         self.unmeasured = 0  # stops without a measurement since the last one with any
         self._backwards = 0
@@ -146,6 +147,11 @@ class Collector:
         self._advanced_ns = rounds[-1]
         if not self.holding:
             self._round(self._complete_ns, rounds)
+
+    def shaken_round(self, rounds: Sequence[int]) -> int:
+        """Return which of the last rounds settled the first stop that was not at rest."""
+        settled = np.array(rounds) - self._late_ns
+        return min(int(np.searchsorted(settled, self._shaken_ns)), len(rounds) - 1)
 
     def hints(self, measurements: int, names: Sequence[str]) -> list[Hint]:
         """Return what looks wrong with the states of joints, given the number of measurements."""
@@ -359,7 +365,9 @@ class Collector:
             rows.keep(slice(due, None))
         for stop in () if moving else plan.stops:
             self.unmeasured = 0 if stop in measured else self.unmeasured + 1
-        self.sampler.add(found)
+        first = self.sampler.add(found)
+        if first is not None:
+            self._shaken_ns = plan.ends[first]
 
     def forget(self, sample: Sample) -> None:
         """Allow another sample with the stamp of this one."""

@@ -58,11 +58,11 @@ class Pipeline:
         self.collector.flush()
         self.hand_over()
 
-    def hand_over(self) -> None:
-        """Hand over the samples made."""
+    def hand_over(self) -> bool:
+        """Hand over the samples made; tell whether they give reason to watch the clocks."""
         made, shaken = self.collector.sampler.take()
         count = self._taken(made)
-        self.clocks.wake(self.collector.sampler.unrest, count - shaken, count)
+        return self.clocks.wake(self.collector.sampler.unrest, count - shaken, count)
 
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the stamps, given the number of measurements."""
@@ -117,6 +117,11 @@ class Pipeline:
         if rounds:
             self.clocks.find(self.collector, rounds[-1])
             self.collector.round(rounds)
-        self.hand_over()
+        woken = self.hand_over()
+        if woken and rounds:  # from the round on that had reason to, as if taken by itself
+            since = rounds[self.collector.shaken_round(rounds)]
+            self.clocks.look(since)
+            place = int(np.argmax(given.joints & (given.times == since)))
+            self.clocks.take(given.between(place + 1, len(given)).pieces)
         if rounds:
             self.clocks.look(rounds[-1])

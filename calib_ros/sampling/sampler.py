@@ -202,14 +202,15 @@ class Sampler:
         )
         yield number, sample
 
-    def add(self, found: list[Numbered]) -> None:
-        """Keep samples in the order of their rounds or stops."""
+    def add(self, found: list[Numbered]) -> int | None:
+        """Keep samples in the order of their stops; return the first stop not at rest."""
         found.sort(key=itemgetter(0))
         calm = sum(number < self._shaken for number, _ in found)
         if self._calm is None and calm < len(found):
             self._calm = len(self.fresh) + calm
-        self._shaken = math.inf
         self.fresh += [sample for _, sample in found]
+        first, self._shaken = self._shaken, math.inf
+        return None if first == math.inf else int(first)
 
     def take(self) -> tuple[list[Sample], int]:
         """Return the samples since the last call, and their number since a restless stop."""

@@ -2,9 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages taken by the batch, as if each were taken by itself."""
 
+from functools import partialmethod
+
 import numpy as np
 import pytest
 from recorded import TYPESTORE, joint_state, point_stamped, pose_stamped
+from streams import hear, stamps, stops
 
 from calib_ros import CalibrationSession, Settings, load_chain
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
@@ -117,6 +120,30 @@ def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
     many.finish()
     assert outcome(one) == outcome(many)
     assert one.samples
+
+
+def test_a_clock_that_moves_is_told_alike_however_many_messages_come_at_once(monkeypatch):
+    """Live they come by tenths of a second, of a bag by thousands."""
+    rng, taken, told = np.random.default_rng(2), CalibrationSession.take, []
+    motion = stops(0.5 * ARM.random_joints(40, rng))
+    times, measured = np.arange(0.0, 79.0, 0.01), np.arange(0.003, 78.7, 0.02)
+    seen = measure(ARM, motion(measured), rng, 2e-5, 1e-4)
+    late = measured + np.where(measured > 52.0, 0.15, 0.0)
+
+    def by(session, size, parts):
+        for k in range(0, len(times) + len(late), size):
+            bits = [part.rows((part.places >= k) & (part.places < k + size)) for part in parts]
+            taken(session, [each for each in bits if len(each.places)])
+
+    for size in (100, 12_000):
+        monkeypatch.setattr(CalibrationSession, 'take', partialmethod(by, size))
+        session = CalibrationSession(ARM, Settings())
+        come = late, stamps(late), seen.positions, seen.rotations
+        hear(session, (times, stamps(times), motion(times)), come)
+        session.finish()
+        told.append((session.delay, session.warnings))
+    assert told[0] == told[1]
+    assert told[0][1]
 
 
 def test_large_messages_are_batches_of_a_few(monkeypatch):
