@@ -168,8 +168,7 @@ class CalibrationSession:
     def usable(self) -> list[Sample]:
         """Return the samples for identification, in the frame of their device.
 
-        Targets measured once are left out if others were measured more often: they do not
-        constrain the arm, and hundreds of them would take minutes.
+        Targets measured once are left out beside others: they constrain nothing, but take minutes.
         """
         frames = {name: self._frames.main(name) for name in {each.device for each in self.samples}}
         found = [each for each in self.samples if each.frame_id in ('', frames[each.device])]
@@ -240,22 +239,24 @@ class CalibrationSession:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return warnings about the measurements."""
-        return tuple(hint.text for hint in self.hints)
+        return tuple(hint.text for hint in self._hints(self.samples))
 
     @property
     def last_hints(self) -> list[Hint]:
         """Return what looks wrong in a motion that has ended; before it may still stop."""
-        return self.hints or self._pipeline.unstopped(len(self.samples))
+        return self._hints(self.samples) or self._pipeline.unstopped(len(self.samples))
 
     @property
     def hints(self) -> list[Hint]:
-        """Return what looks wrong in the received messages."""
+        """Return what looks wrong in the received messages; of a frozen device, if it is now."""
+        return self._hints(self.samples[-NO_ACCIDENT:])
+
+    def _hints(self, recent: Sequence[Sample]) -> list[Hint]:
         in_sockets = self.settings.mode == 'triggered' and self.received  # perhaps: not measured
         found = [] if self.samples or in_sockets else unheard(self.received)
         if words := self._different:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}', explains=False))
-        if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
-            found.append(hint)
+        found += [hint] if frozen(recent) and (hint := frozen(self.samples)) else []
         found += self._names.silent_ones(self._collector.track.silent())
         found += self._pipeline.hints(self.received[POSES])
         found += spoilt(self.samples, found)
