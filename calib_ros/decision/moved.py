@@ -53,6 +53,8 @@ class Step:
     where: str
     apart: bool = False
     turned: str = ''
+    instead: str = ''
+    """What `looks_alike`, if the zero of a joint moved."""
     held: bool = False
     """Whether a frame that the chain file holds is wrong from the first pose on."""
     slow: bool = False
@@ -138,11 +140,12 @@ class Step:
         thing, of = self.thing, f' ({self.what})'
         if self.kind in ZEROS:
             thing, of = f'the zero of {self.what}', ''
-        text, more = f'{thing} moved {size}{of} before {self._where}', ''
+        text = f'{thing} moved {size}{of} before {self._where}'
+        more = f'; or {self.instead}' * bool(self.instead)
         if self.slow:
             text = f'{thing} seems to have moved slowly, {size} over the session{of}'
             if self.kind == 'joint':
-                more = '; the correction is now off by half of that: see why, and measure again'
+                more += '; the correction is now off by half of that: see why, and measure again'
             more += '; if the poses follow an order, errors of the arm may look so: mix them'
         elif self.kind in OF_THE_ARM:
             text, more = f'{thing} changed before {self._where}', f': poses differ {size}'
@@ -178,6 +181,16 @@ def place_of(problem: Problem, number: int, sample: int) -> str:
     line = rows_in_words([sample], seen.stamps_ns)
     where = line if seen.pixels is None else f'{where}, {line}'
     return f'{where}{IF_IN_ORDER}'
+
+
+def looks_alike(problem: Problem, owner: str) -> str:
+    """Return what turns, or slides, as the zero of the first or of the last joint does."""
+    first, last = problem.chain.joints[0], problem.chain.joints[-1]
+    kind, joint = ('tool', last) if owner == last.name else ('base', first)
+    if owner != joint.name or len({getattr(each, kind) for each in problem.sets}) > 1:
+        return ''
+    how = 'turned about' if joint.type == 'revolute' else 'slid along'
+    return f'{thing_of(kind, problem.sets[0])} {how} the axis of this joint'
 
 
 def thing_of(kind: str, seen: Observations, several: bool = False) -> str:

@@ -30,6 +30,7 @@ from calib_ros.decision.moved import (
     ZERO,
     ZEROS,
     Step,
+    looks_alike,
     place_of,
     thing_of,
 )
@@ -371,6 +372,7 @@ def _step_of(scan: Scan, found: _Found, number: int) -> Step | None:
         where=place_of(problem, of_set, int(sample)),
         apart=abs(size) <= most and any(_separable(joints, counts >= k) for k in near),
         turned=_turned(scan, found.stops) if abs(size) <= most and not found.slow else '',
+        instead=looks_alike(problem, group.owners[0]),
         held=bool(held),
         slow=found.slow,
         spoils=found.spoils,

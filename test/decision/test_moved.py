@@ -128,6 +128,12 @@ ZERO = replace(FRAME, owners=('wire',), kind='zero', thing='the device', longer=
             f'the zero of elbow_joint moved by 1.2 mrad before pose 7{AGAIN}',
         ),
         (
+            replace(JOINT, instead='the target turned', unused=BEFORE_THAT),
+            'the zero of elbow_joint moved by 1.2 mrad before row 5; or the target turned; '
+            'measurements before that carry no weight',
+            f'the zero of elbow_joint moved by 1.2 mrad before pose 7{AGAIN}',
+        ),
+        (
             replace(JOINT, size=4.712),
             'the zero of elbow_joint moved by 90° before row 5',
             f'the zero of elbow_joint moved by 90° before pose 7{AGAIN}',
@@ -164,6 +170,24 @@ def test_several_zeros_are_of_the_arm():
     )
     assert step.reason.rule is Rule.ENCODER
     assert replace(step, unused=FROM_THERE).harmful
+
+
+@pytest.mark.parametrize(
+    ('joint', 'instead'),
+    [
+        (0, "the measuring device or the robot's foot turned about the axis of this joint"),
+        (2, ''),
+        (5, 'the target turned about the axis of this joint'),
+    ],
+)
+def test_the_zero_of_an_end_joint_is_named_with_what_looks_alike(joint, instead):
+    """A target that turned on its flange "was" a joint that lost its zero."""
+    rng = np.random.default_rng(2)
+    true, q = arm(rng), UR10E.random_joints(30, rng)
+    slipped = q + 5e-3 * np.outer(np.arange(30) >= 18, np.arange(6) == joint)
+    seen = replace(measure(true, slipped, rng, *NOISE), joints=q)
+    step = find_step(fitting.fit(Problem(UR10E, seen, **SIGMAS)))
+    assert (step.what, step.instead) == (UR10E.joint_names[joint], instead)
 
 
 @pytest.mark.parametrize(('seed', 'sample'), [(3, 19), (31, 22)])
