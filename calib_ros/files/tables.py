@@ -28,7 +28,16 @@ from calib_ros.files.names import in_doubt, like_joints, option, quaternions_in,
 from calib_ros.files.selection import select_rows, without_others
 from calib_ros.files.skipped import drop_unmeasured
 from calib_ros.files.summary_rows import without_statistics
-from calib_ros.files.vocabulary import MATRIX, POSITION, QUATERNION, TURNS, WORDS, joint_columns
+from calib_ros.files.vocabulary import (
+    COVARIANCE,
+    MATRIX,
+    POSITION,
+    QUATERNION,
+    SIGMAS,
+    TURNS,
+    WORDS,
+    joint_columns,
+)
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.dataset import Dataset, dataset_of
 from calib_ros.settings import Settings
@@ -92,6 +101,8 @@ def _of_csv(path: Path, joints: int, progress: Notify) -> tuple[Columns, tuple[s
             raise ColumnsError(f'{path} has rows without numbers')  # remarks, perhaps titles
     if {*MATRIX} <= {*cells}:
         raise ColumnsError(f'{path} has rotation matrices: calib_ros import makes quaternions')
+    if {*SIGMAS[:3]} <= {*low.values()} and COVARIANCE[0] not in cells:
+        raise ColumnsError(f'{path} has standard deviations: calib_ros import makes covariances')
     notes = [f'{path}: the column {name} is read as {ours}' for name, ours in meant.items()]
     notes += [f'{path}: {note}' for note in left]
     notes += (*skipped, *joints_left_out(path, found.header, joints))

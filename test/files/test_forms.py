@@ -14,7 +14,7 @@ from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, layout_of
 from calib_ros.files.programs import read_joints
-from calib_ros.files.vocabulary import MATRIX, SEPARATORS
+from calib_ros.files.vocabulary import MATRIX, POSE_COLUMNS, SEPARATORS, SIGMAS
 from calib_ros.kinematics.chain import Joint
 
 ARM = Chain('arm', 'standard', (Joint('a'), Joint('b')))
@@ -194,6 +194,18 @@ def test_empty_stamps_are_lines_and_rows_without_any_measurement_are_told(path):
     assert read_table(path, 2).fitted[0].stamps_ns.tolist() == [2_000_000_000, 7]
     path.write_text('q1,q2,x,y,z\n1,2,-,-,-\n1,2,nan,nan,nan\n')
     with pytest.raises(InputError, match='nothing measured in lines 2, 3: rows need x, y, z'):
+        read_table(path, 2)
+
+
+@pytest.mark.parametrize('names', [SIGMAS[:3], SIGMAS])
+def test_standard_deviations_beside_our_own_columns(guessed, path, names):
+    """They were left out with a warning, unless the table had a unit or another separator."""
+    sizes, quat = np.full((3, len(names)), 2e-3), TURNED.as_quat()
+    text = text_of(JOINTS, PLACES, quat, sizes, names=['q1', 'q2', *POSE_COLUMNS, *names])
+    (found,) = guessed(text).fitted
+    told = np.diag([4e-6] * len(names) + [0.0] * (6 - len(names)))
+    np.testing.assert_allclose(found.covariance, np.tile(told, (3, 1, 1)), atol=1e-18)
+    with pytest.raises(InputError, match='has standard deviations: calib_ros import'):
         read_table(path, 2)
 
 
