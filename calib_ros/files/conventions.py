@@ -152,8 +152,13 @@ def _covariance(made: Columns, axes: FloatArray | None) -> FloatArray | None:
             f'{made.path}: standard deviations of rotations need srx, sry, srz, and rotations'
         )
     found = np.zeros((len(made.lines), 6, 6))
-    found[:, :3, :3] = np.square(made.numbers(place))[:, :, np.newaxis] * np.eye(3)
+    found[:, :3, :3] = np.square(_sizes(made, place))[:, :, np.newaxis] * np.eye(3)
     if turn and axes is not None:
-        scaled = axes * made.numbers(turn)[:, np.newaxis, :]
+        scaled = axes * _sizes(made, turn)[:, np.newaxis, :]
         found[:, 3:, 3:] = scaled @ np.swapaxes(scaled, 1, 2)
     return found
+
+
+def _sizes(made: Columns, names: Sequence[str]) -> FloatArray:
+    """Return standard deviations (N, len(names)); blank ones are not stated: 0."""
+    return np.nan_to_num(made.numbers(names))

@@ -201,10 +201,12 @@ def test_empty_stamps_are_lines_and_rows_without_any_measurement_are_told(path):
 def test_standard_deviations_beside_our_own_columns(guessed, path, names):
     """They were left out with a warning, unless the table had a unit or another separator."""
     sizes, quat = np.full((3, len(names)), 2e-3), TURNED.as_quat()
+    sizes[1] = np.nan  # not stated
     text = text_of(JOINTS, PLACES, quat, sizes, names=['q1', 'q2', *POSE_COLUMNS, *names])
     (found,) = guessed(text).fitted
     told = np.diag([4e-6] * len(names) + [0.0] * (6 - len(names)))
-    np.testing.assert_allclose(found.covariance, np.tile(told, (3, 1, 1)), atol=1e-18)
+    expected = np.array([told, np.full((6, 6), np.nan), told])
+    np.testing.assert_allclose(found.covariance, expected, atol=1e-18)
     with pytest.raises(InputError, match='has standard deviations: calib_ros import'):
         read_table(path, 2)
 
