@@ -144,7 +144,8 @@ def with_terms(
     if seen.of_wire:
         weights = np.ones(len(seen)) if samples.weights is None else samples.weights
         own[wires.index(seen.base)] = (terms * weights / samples.sigmas[0])[:, np.newaxis]
-    return np.concatenate([rows[:-1], own.reshape(-1, *rows.shape[1:]), rows[-1:]])
+    own = own.reshape(len(wires) * len(terms), *rows.shape[1:])  # of no samples, too
+    return np.concatenate([rows[:-1], own, rows[-1:]])
 
 
 def _terms(chain: Chain, each: Observations) -> FloatArray:

@@ -13,6 +13,7 @@ from in_sockets import cell
 from calib_ros import Chain, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.rounding import lost_digits
+from calib_ros.decision.scan import Scan
 from calib_ros.decision.wires import wrong_distances
 from calib_ros.estimation.fitting import fit
 from calib_ros.kinematics.chain import Frame, Joint
@@ -66,6 +67,18 @@ def test_the_zero_of_a_draw_wire_is_named(zero, effects):
     found = re.search(rf'distances are (\S+) mm too {way}', ' '.join(map(str, result.refusals)))
     assert (found is not None) is bool(zero)
     assert not zero or float(found[1]) == pytest.approx(1e3 * abs(zero), abs=0.5)
+
+
+def test_no_move_tears_off_gross_errors_of_distances_that_lie_apart():
+    """A session of distances with gross errors, and a move that the arm imitates, had no result.
+
+    No rows were selected, and none could be made of them: a traceback.
+    """
+    *_, seen = measured_arm(21, 60, (3e-5, 0.0), oriented=False)
+    lengths = norms(seen.positions) + 0.02 * np.isin(np.arange(60), (5, 40))
+    scan = Scan(fit(Problem(UR10E, replace(seen, distances=lengths))), False, 0)
+    group = next(each for each in scan.groups if each.kind == 'base')
+    assert not scan.tears(group, np.ones(len(group.names)))
 
 
 @pytest.mark.parametrize('seed', [112, 127, 177])
