@@ -65,12 +65,10 @@ def chosen(result):
     return {group_of(name) for name, _ in result.chain.effects}
 
 
-@pytest.mark.parametrize(
-    ('group', 'size', 'seed'), [*(('eccentricity', 7e-4, k) for k in (0, 1)), ('gravity', 1e-2, 0)]
-)
-def test_effects_larger_than_usual_are_not_taken_for_noise(unsearched, group, size, seed):
+@pytest.mark.parametrize(('group', 'size'), [('eccentricity', 7e-4), ('gravity', 1e-2)])
+def test_effects_larger_than_usual_are_not_taken_for_noise(unsearched, group, size):
     """The first fit holds them at their usual size; what it leaves is no noise, then or later."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     names = effects.members(UR10E, group)
     values = dict(zip(names, rng.normal(scale=size, size=len(names)).tolist(), strict=True))
     true = faulty(UR10E, Cell(), rng).with_effect_values(values)

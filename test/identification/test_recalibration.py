@@ -79,10 +79,9 @@ def test_a_bent_link_is_named(earlier):
     assert rms(found.calibration.chain, now, Q) < 0.3 * rms(previous.chain, now, Q)
 
 
-@pytest.mark.parametrize('seed', range(2))
-def test_what_was_held_nominal_may_be_told_by_new_poses(seed):
+def test_what_was_held_nominal_may_be_told_by_new_poses():
     """The elbow stood still in the earlier session, then first still and then not."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     true = faulty(UR10E, Cell(), rng)
     q = [UR10E.random_joints(count, rng) for count in (60, 20, 20)]
     q[0][:, 2] = q[1][:, 2] = 1.4
@@ -110,14 +109,13 @@ def test_of_an_arm_that_has_not_changed_nothing_is_claimed(earlier):
     )
 
 
-@pytest.mark.parametrize('seed', range(2))
-def test_errors_that_the_model_lacks_do_not_spoil_an_update(seed):
+def test_errors_that_the_model_lacks_do_not_spoil_an_update():
     """They are put down to considered effects, which the chain in use leaves out."""
-    true = faulty(UR10E, Cell(), np.random.default_rng(seed))
+    true = faulty(UR10E, Cell(), np.random.default_rng(0))
     names = [f'{joint.name}.{wave}_1' for joint in UR10E.joints for wave in ('sin', 'cos')]
     true = true.with_effects(names).with_offsets(dict.fromkeys(names, 3e-4))
-    first = Calibration.of(identify(problem(true, 80, seed)))
-    done = recalibrate(first, problem(true, 20, seed + 100), 0.0)
+    first = Calibration.of(identify(problem(true, 80, 0)))
+    done = recalibrate(first, problem(true, 20, 100), 0.0)
     assert done.accepted
     assert done.after.rms_mm < 1.02 * done.before.rms_mm
     assert done.calibration.chain.effects == first.chain.effects
@@ -194,14 +192,13 @@ def test_one_gross_error_among_few_poses_is_named_beside_a_slipped_zero(earlier)
     assert not recalibrate(previous, seen, 0.1).odd
 
 
-@pytest.mark.parametrize('seed', range(2))
-def test_one_pose_shows_no_change(earlier, seed):
+def test_one_pose_shows_no_change(earlier):
     """It may be a typing error, or a joint that has slipped: no other pose tells."""
     true, previous = earlier
     slipped = true.with_offsets({'elbow_joint.theta': 2e-3})
-    seen = problem(true, 1, seed)
+    seen = problem(true, 1, 0)
     wrong = but(seen, positions=seen.observations.positions + np.array([2e-3, -1e-3, 2e-3]))
-    for single in (wrong, problem(slipped, 1, seed)):
+    for single in (wrong, problem(slipped, 1, 0)):
         found = recalibrate(previous, single, 0.1)
         assert found.changed
         assert not found.determined
