@@ -55,13 +55,13 @@ def session(seed, errors, kind, count=96, width=0.8, shuffled=False, true=None):
 
 
 def test_a_drift_is_no_gain_of_the_arm():
-    """At 95 %: of 8 arms without any error two or more are accepted once in 17 times."""
-    seen = (session(seed, 0.0, kind) for kind in DRIFTS for seed in range(2))
+    """At 95 %: of 4 arms without any error two or more are accepted once in 70 times."""
+    seen = (session(k % 2, 0.0, kind) for k, kind in enumerate(DRIFTS))
     results = [identify(Problem(UR10E, each, **SIGMAS)) for each in seen]
     assert sum(result.accepted for result in results) <= 1
     # by held-out poses alone most of them would be
     alone = [all(each.rule is Rule.DRIFT for each in result.refusals) for result in results]
-    assert sum(alone) > 3
+    assert sum(alone) > 1
 
 
 def test_an_arm_with_errors_is_accepted_though_the_tracker_drifts():
@@ -71,10 +71,11 @@ def test_an_arm_with_errors_is_accepted_though_the_tracker_drifts():
     """
     accepted = 0
     for seed, kind in enumerate(DRIFTS):
-        accepted += identify(Problem(UR10E, session(seed, 1.0, kind), **SIGMAS)).accepted
-        shuffled = session(seed, 0.3, kind, width=None, shuffled=True)
-        accepted += identify(Problem(UR10E, shuffled, **SIGMAS)).accepted
-    assert accepted >= 7
+        seen = session(seed, 1.0, kind)
+        if seed < 2:
+            seen = session(seed, 0.3, kind, width=None, shuffled=True)
+        accepted += identify(Problem(UR10E, seen, **SIGMAS)).accepted
+    assert accepted >= 3
 
 
 def test_the_chance_is_uniform_where_there_is_nothing_to_gain():

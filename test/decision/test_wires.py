@@ -224,10 +224,9 @@ def test_distances_alone_show_no_scale(scale):
     assert not told(fit(Problem(UR10E, replace(seen, distances=far))))
 
 
-@pytest.mark.parametrize('seed', [2, 3])
-def test_a_cable_over_a_pulley_is_named(seed):
+def test_a_cable_over_a_pulley_is_named():
     """Of 20 mm in radius: 8 of 24 arms were accepted although it had made them worse."""
-    _, _, seen = in_front(200, seed)
+    _, _, seen = in_front(200, 2)
     far = over_a_pulley(seen.positions - ANCHOR, 0.02)
     (found, *_) = identify(Problem(UR10E, replace(seen, distances=far))).refusals
     assert found.startswith('distances depend on the direction of the cable')
