@@ -269,7 +269,7 @@ def test_a_full_disk(tmp_path, recording):
         _, hard = resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE)
         full = path.stat().st_size + 100  # there is room for a part of the next row
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (full, hard))
-        play(6, 24)
+        play(6, 16)
 
         def level(wanted, said):
             cell.spin_until(lambda: heard and heard[-1].status[0].level == wanted)
@@ -278,7 +278,7 @@ def test_a_full_disk(tmp_path, recording):
         level(DiagnosticStatus.ERROR, 'poses are in memory only')
         cell.spin_until(lambda: told and told[-1].data.startswith('poses are in memory only: '))
         assert heard[-1].status[0].message.count('in memory only') == 1
-        cell.spin_until(lambda: values_of(heard[-1])['samples'] == '22')
+        cell.spin_until(lambda: values_of(heard[-1])['samples'] == '14')
         assert len(samples_in(tmp_path)) == 4
         answer = cell.refused('clear')
         assert 'poses are in memory only and would be lost' in answer.message
@@ -293,7 +293,7 @@ def test_a_full_disk(tmp_path, recording):
         assert 'memory' not in heard[-1].status[0].message
         assert ' poses' in heard[-1].status[0].message
         cell.spin_until(lambda: 'memory' not in told[-1].data)
-        assert len(samples_in(tmp_path)) == STOPS
+        assert len(samples_in(tmp_path)) == 16
         cell.done('save')
         assert child.end(signal.SIGINT) == 0
         assert child.output.count('poses are kept in memory only') == 1

@@ -75,22 +75,20 @@ def test_messages_are_taken_while_an_identification_runs(tmp_path, recording, he
         assert again.result().success, again.result().message
 
 
-def test_a_noisier_device_condemns_no_arm(tmp_path, recording, rng, monkeypatch):
+def test_a_noisier_device_condemns_no_arm(cell, recording, rng, monkeypatch):
     """By ~/check it no longer held, where ~/validate could not tell."""
     monkeypatch.setattr(recalibration, '_without_one', lambda *_: ())  # which pose is odd
-    noisy, parameters = pose_messages(recording.poses), {'chain': 'ur10e'}
+    noisy = pose_messages(recording.poses)
     for k, off in enumerate(np.repeat(rng.normal(0.0, 1e-3, STOPS), len(noisy) // STOPS)):
         noisy[k].pose.position.x += off
-    with Cell(**parameters, data_dir=str(tmp_path)) as cell:
-        cell.play(topics(recording))
-        cell.done('identify')
-        cell.done('save')
+    cell.play(topics(recording))
+    cell.done('identify')
+    cell.done('clear')
+    cell.play(topics(recording, measured_pose=noisy))
     for sigma in (1e-4, 1e-3):  # the first is not stated
-        with Cell(**parameters, data_dir=str(tmp_path), sigma_position=sigma) as cell:
-            cell.done('load')
-            cell.play(topics(recording, measured_pose=noisy))
-            assert 'too much noise to tell' in cell.refused('validate').message
-            assert cell.call('check').success == (sigma > 1e-4)
+        cell.set_parameters({'sigma_position': sigma})
+        assert 'too much noise to tell' in cell.refused('validate').message
+        assert cell.call('check').success == (sigma > 1e-4)
 
 
 def test_no_earlier_calibration_is_taken_for_the_one_that_is_identified(cell, recording, held):
