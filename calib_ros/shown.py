@@ -29,12 +29,12 @@ def some(words: Sequence[str], most: int = NAMED) -> list[str]:
 
 
 def rounded(value: float, sign: str = '') -> str:
-    """Return mm or mrad with three decimals, more if two digits need them, or none from 1e3 on."""
-    if math.isfinite(value) and abs(value) >= 1e3:
+    """Return mm or mrad with three decimals, more if two digits need them, fewer from 100."""
+    if math.isfinite(value) and abs(value) >= 999.95:
         return f'{value:{sign}{"," if abs(value) >= 1e4 else ""}.0f}'  # 1,210 may be read as 1.210
     told = math.isfinite(value) and abs(value) >= 1e-6  # less is what computing leaves
     digits = 1 - math.floor(math.log10(abs(value))) if told else 0
-    return f'{value:{sign}.{max(3, digits)}f}'
+    return f'{value:{sign}.{1 if abs(value) >= 100.0 else max(3, digits)}f}'
 
 
 def two_digits(value: float) -> str:

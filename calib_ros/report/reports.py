@@ -180,24 +180,25 @@ def may_be_closer(result: Identification, beyond: bool = False) -> bool:
 def _steps(
     result: Identification, reasons: Sequence[Advice], wanted_mm: float | None
 ) -> tuple[str, ...]:
-    if not result.accepted:
-        return () if _sound(reasons) else (reasons[0].again,)
-    interval = interval_of(result.comparison, 1)
+    if not (result.accepted or _sound(reasons)):
+        return (reasons[0].again,)
+    used = result.accepted
+    interval = interval_of(result.comparison, int(used))
     verdict = '' if wanted_mm is None else compared(1e-3 * wanted_mm, *interval)
     whole = result.region is None or result.region.whole
     found = {
         'First check what is named above. If it is true, remove the cause and identify '
-        'again.': bool(result.remarks),
-        sentence(CLOSER): may_be_closer(result, verdict == 'FAIL'),
+        'again.': used and bool(result.remarks),
+        sentence(CLOSER): used and may_be_closer(result, verdict == 'FAIL'),
         'Compare the remaining error with the accuracy of the measuring device: no calibration '
         'gets below that.': verdict == 'FAIL',
         f'Measure more poses to decide on the tolerance, {SPREAD_OUT}.': verdict == 'UNDECIDED',
-        sentence(bring(result)): True,
+        sentence(bring(result)): used,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
-        'arm: calib_ros verify; again after a collision or repair.': whole,
+        'arm: calib_ros verify; again after a collision or repair.': used and whole,
         'Then measure at least five new poses near these and judge the corrected arm: calib_ros '
         'verify; again after a collision or repair. To use it elsewhere, measure there too and '
-        'identify again.': not whole,
+        'identify again.': used and not whole,
     }
     return tuple(step for step, needed in found.items() if needed)
 

@@ -139,7 +139,11 @@ def notes(result: Identification) -> list[str]:
 
 
 def error_meaning(result: Identification) -> str:
-    """Return what errors of distances, planes and corners mean; empty for positions alone."""
+    """Return what errors of sockets, distances, planes, corners mean; empty for positions."""
+    if all(each.socket for each in result.problem.sets):
+        size = rounded(sigma_over_range(result)['median'])
+        of_all = f'expect {size} mm over the joint range'
+        return f'errors in sockets leave out the scale of the bar: {of_all}'
     position = result.comparison.after.position
     if (np.abs(position[:, 0]) > SAME)[~position[:, 1:].any(axis=1)].any():
         return (

@@ -284,9 +284,14 @@ class Identifying:
 
 
 def _cut(text: str, longest: int) -> str:
-    """Return a text without its last words if too long; half of "RMS 2 -> 1 mm" misleads."""
+    """Return a text without its last words if too long, nor a bracket that they would close.
+
+    Half of "RMS 2 -> 1 mm" misleads.
+    """
     glued = re.sub(r'(?<=\d) | (?=\d)', '\0', text)
-    return textwrap.shorten(glued, longest, placeholder='').rstrip(',;:').replace('\0', ' ')
+    kept = textwrap.shorten(glued, longest, placeholder='').replace('\0', ' ')
+    whole = kept.rpartition(' (')[0] if kept.count('(') > kept.count(')') else kept
+    return whole.rstrip(',;:')
 
 
 def _moved(result: Identification, given: Snapshot) -> str:

@@ -25,6 +25,7 @@ from calib_ros.identification.records import nominal_document
 from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.report.words import notes
 from calib_ros.settings import Settings
 from calib_ros.texts import dump_yaml
 
@@ -53,7 +54,9 @@ def test_a_device_of_the_name_of_anothers_frame_has_a_frame_of_its_own():
 def test_in_sockets_it_holds_up_to_its_former_error():
     """A joint off by 0.2 mm and 0.2 mrad was within a limit of 50 times that error."""
     _, problem = in_sockets.cell(0, noise=1e-5, count=10)
-    found = Calibration.of(identify(problem))
+    result = identify(problem)
+    assert notes(result)[0].startswith('errors in sockets leave out the scale of the bar: ')
+    found = Calibration.of(result)
     assert found.limit(problem.sets, 2.0) == found.limit() == ALIKE * found.residual
 
 

@@ -208,6 +208,8 @@ def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, sigma, state
     told, good = report.verdict, state == 'info'
     assert (told.state, 'tolerance' in told.heading, '0.' in told.gain) == (state, good, good)
     assert (report.advice[0].meaning == refusals.GOOD_ARM.meaning) == good
+    undecided = report_of(problem, result, tolerance=1e-3 * result.comparison.figures[0].rms_mm)
+    assert undecided.steps[0].startswith('Measure more poses to decide') == good
 
 
 def test_the_verdict_of_an_accepted_result_says_where_it_holds_and_what_is_doubtful(solved):

@@ -86,12 +86,12 @@ def test_an_accepted_answer_keeps_its_hint_whole_and_says_how_to_save(cell, tmp_
     identifying._journal = tmp_path / 'ur10e_20260102T030405000006Z.csv'
     verdict, hint = 'accepted: 40 poses, RMS 1.911 -> 0.0053 mm', 'J moves one way: mix the order'
     said, end = f'{verdict} (95 %: 0.0045 to 0.006 mm); {"valid " * 30}', KEEP + NOT_FILED
-    for advice, cut in ((hint, f' ... {hint}{end}'), ('', f' ...{end}')):
+    for advice, kept in ((hint, f' {hint}'), (f'{hint} ({30 * "then "})', f' {hint}'), ('', '')):
         identifying._short = said, advice, end
         _, found = identifying.shortened((True, 20 * said))
         assert len(found) <= 200
         assert found.startswith(verdict)
-        assert f'{cut} ... full text: ' in found
+        assert f' ...{kept}{end} ... full text: ' in found
 
 
 @pytest.mark.parametrize('folder', ['data', 'of a cell with a long name ' * 9])

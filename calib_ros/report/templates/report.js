@@ -82,7 +82,8 @@
   const state = { when: 'after', picked: -1, page: 0, component: 'length', rows: all };
   const byId = (id) => document.getElementById(id);
   const escaped = (text) => text.replaceAll('&', '&amp;').replaceAll('<', '&lt;');  // plotly reads tags
-  const digitsOf = (x) => (Math.abs(x) < 1e-6 ? 3 : Math.max(3, 1 - Math.floor(Math.log10(Math.abs(x)))));
+  const digitsFrom = (x) => (x < 1e-6 ? 3 : x < 100 ? Math.max(3, 1 - Math.floor(Math.log10(x))) : x < 999.95 ? 1 : 0);
+  const digitsOf = (x) => digitsFrom(Math.abs(x));
   const fixed = (x, digits = digitsOf(x)) => (Number.isFinite(x) ? x.toFixed(digits) : '');
   const scale = () => Number((10 ** Number(byId('scale').value)).toPrecision(2));
 
