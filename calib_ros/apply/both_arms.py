@@ -122,7 +122,7 @@ def _match_commands(
     if lost.size:
         raise InputError(
             f'measurement {lost[0] + 1} was taken {far[lost[0]]:.3g} rad or m from the nearest '
-            'commanded joint values: was that program driven, and is no joint a full turn away?'
+            'commanded joint values: was that program run, and is no joint a full turn away?'
         )
     change = Compensator(nominal, calibrated).follower.solve(commanded).change
     both = np.concatenate([commanded, commanded + change])

@@ -82,7 +82,7 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
         f'{rounded(1e3 * before)} -> {rounded(1e3 * after)}'
         for before, after in ((shifted, shift), (turned, turn))
     )
-    text += f'; largest error by the calibration {shifts} mm, {turns} mrad'
+    text += f'; largest predicted error {shifts} mm, {turns} mrad'
     if not compensator.follower.complete and turn > turned:
         x, y, z = compensator.tool
         text += (
@@ -94,8 +94,8 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
         squares = result.position[kept] ** 2 - result.reachable[kept] ** 2
         across = np.sqrt(max(float(squares.max()), 0.0))  # less than zero is rounding
         text += (
-            '; this arm cannot move its target in every direction: of the position '
-            f'{rounded(1e3 * across)} mm are left, which no joint can correct'
+            '; this arm cannot move its target in every direction: '
+            f'{rounded(1e3 * across)} mm are left that no joint can correct'
         )
     if result.damped[kept].any():
         text += f'; {np.count_nonzero(result.damped[kept])} corrected in part'

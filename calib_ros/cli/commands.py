@@ -87,7 +87,7 @@ what to simulate
   --out FOLDER=demo  output folder
   --force  {FORCE}
 {SIMULATION}
-# robots robots._robots  list the arms that come with calib_ros
+# robots robots._robots  list the arms supplied
 $ robots
 # chain robots._chain  print the chain file of a robot, to read or edit
 $ chain ur10e

@@ -273,7 +273,7 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
         if each.steps:
             screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
     if not all(each.steps for each in reasons):
-        screen.bullet('What else was found probably follows from it: the report (--out) lists it')
+        screen.bullet('Other findings probably follow from it: the report (--out) lists them')
         return
     explained = (BRINGS.keys() - UNSURE) & {each.rule for each in result.refusals}
     if not explained and 1.0 < result.noise.position < FAR and not result.noise.consistent:

@@ -35,7 +35,7 @@ PROGRAMS = ('compensate', 'plan', 'workspace')
 def unknown_word(word: str, parser: argparse.ArgumentParser) -> str:
     """Return what is wrong with a word that the parser does not know."""
     if not word.startswith('-'):
-        hint = ': of several files make one table, with a column session (or target, device)'
+        hint = ': join several files in one table, with a column session (or target, device)'
         several = hint * ('--session' in parser._option_string_actions)
         return f'unexpected argument "{word}"{several}'
     option = word.partition('=')[0]
@@ -96,7 +96,7 @@ def parser_of(given: Sequence[str]) -> argparse.ArgumentParser:
         add_options(added, command.options)
         added.usage = _usage(added)
         add_more = added.add_argument_group('output').add_argument
-        text = 'print only warnings, errors and the output asked for'
+        text = 'print only warnings, errors and requested output'
         add_more('--quiet', action='store_true', help=text)
         add_more('-h', '--help', action='help', help='show this help')
     return parser

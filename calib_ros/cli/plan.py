@@ -30,7 +30,7 @@ from calib_ros.report.plan import VISIT, accuracy_in_words, outlook, plan_report
 
 TESTS = 'P1 to P5 of ISO 9283 in a cube of {:.3f} m, in {}; collisions are not checked'
 NOISE = 'device noise: {:g} mm in each direction (--sigma-position)'
-WITH_TURNS = 'orientations count as measured, too (for a reflector alone: --measured position)'
+WITH_TURNS = 'orientations count as measured too (for a reflector alone: --measured position)'
 NOT_OF_TESTS = ('poses', 'accuracy', 'candidates', 'task', 'taken', 'draw', 'criterion', 'apart')
 ORIENTED = 'various orientations', 'one orientation'
 

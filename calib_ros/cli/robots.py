@@ -25,7 +25,7 @@ def _robots(options: argparse.Namespace, screen: Screen) -> int:
         lines.append(f'{name:21}{len(chain.joints):6}  {chain.convention:10}{length:6.2f} m')
     screen.data('\n'.join(lines))
     screen.say('')
-    screen.say('calib_ros chain NAME prints one; another arm needs its URDF or such a file')
+    screen.say('calib_ros chain NAME prints one; any other arm needs a URDF or chain file')
     return 0
 
 

@@ -50,7 +50,7 @@ def refusals(
     failed, validation = [*_fit_refusals(problem, result, own_behaviour)], result.validation
     if validation is None:
         count = count_distinct(result.fitted.after.configurations)
-        text = f'{count} different poses: too few to hold some out'
+        text = f'{count} different poses, too few to hold some out'
         return (*failed, Reason(Rule.CONFIGURATIONS, text))
     share = validation.share_of_outliers
     if share > MOST_OUTLIERS:
@@ -110,7 +110,7 @@ def _fit_refusals(
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
         far = some([f'{p.name} by {_far(p, problem.largest_angle)}' for p in beyond])
-        text = f'off by more than even a faulty robot of this kind: {", ".join(far)}'
+        text = f'further off than even a faulty robot of this kind: {", ".join(far)}'
         several = sum(p.name.is_length for p in beyond) > 1
         yield Reason(Rule.COMMON_SENSE, _other_unit(result) * several + text)
 
@@ -203,7 +203,7 @@ def _one_sided(problem: Problem, posterior: Posterior) -> str:
     stated = ','.join(dict.fromkeys(f'*.{name.kind}=1e-6' for name in play))
     return bool(found) * (
         f'{", ".join(some(found))} moved to all poses from the same side, which hides play: '
-        'expected errors include as much as is likely. Approach poses from both sides to measure '
+        'expected errors include its likely size. Approach poses from both sides to measure '
         'it; if the same side is also used later, it does no harm: --model backlash --priors '
         f'"{stated}"'
     )

@@ -64,7 +64,7 @@ def timed(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
                 told.append(
                     f'measurements of {base} are early or late by {two_digits(1e3 * jitter)} ms '
                     'at random: stamps jitter, or the device or the joint states are smoothed. '
-                    f'Figures are without what that explains of errors. {remedy}'
+                    f'Figures leave out what this explains. {remedy}'
                 )
     except (CalibrationError, np.linalg.LinAlgError):  # told by the whole fit
         pass
@@ -232,8 +232,8 @@ def uneven(problem: Problem, result: Identification) -> tuple[str, Problem | Non
     else:
         ratio = 0.0 * ratio
         text = (
-            f'joints late by different times explain {explain}, above all '
-            f'{play[int(np.argmax(late))].owner}: read all joints at one moment, unfiltered, look '
+            f'joints with different delays explain {explain}, above all '
+            f'{play[int(np.argmax(late))].owner}: read all joints at once, unfiltered, look '
             'for wrong speeds, or stop at each pose (mode dwell)'
         )
     sets = []
@@ -255,7 +255,7 @@ def other_delay(problem: Problem, result: Identification) -> str:
         if abs(found - read) > 0.5 * Settings.max_gap:
             return (
                 f'joint values were read for measurements {read:.3f} s late, but these are about '
-                f'{found:.3f} s late: set delay to {found:.3f}, and sample anew'
+                f'{found:.3f} s late: set delay to {found:.3f} and sample again'
             )
     return ''
 
@@ -278,7 +278,7 @@ def unsteady(problem: Problem, result: Identification) -> tuple[str, bool]:
     unit = small_units(problem.chain.joints)
     text = (
         f'joints seem off by {two_digits(1e3 * lacking.turns)} {unit} at random, from pose to '
-        'pose: the arm moved while it was measured, joint values and poses are not of one moment, '
+        'pose: the arm moved while it was measured, joint values and poses are not simultaneous, '
         'values lack digits, joints have play, or devices or targets lack names. Stop at each '
         'pose, and compare the clocks'
     )

@@ -57,7 +57,7 @@ def gain_refusals(
     elif result.chance is not None and result.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
-            'a slow drift may explain the gain: shifted to the wrong poses, errors can be '
+            'a slow drift may explain the gain: errors shifted to the wrong poses can be '
             f'corrected just as well in {100.0 * result.chance:.0f} % of cases '
             f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )

@@ -109,9 +109,9 @@ def repeating(
             names = rows_in_words(rows.tolist(), seen.stamps_ns, of_messages)
             return Suspect(
                 f'{what} repeated in {names} while the rest moved',
-                'leave these rows out, and look why its source stood still',
+                'leave these rows out, and see why its source stood still',
                 rank=0,
-                published='look why its publisher repeats old values',
+                published='see why its publisher repeats old values',
             )
     return None
 

@@ -146,7 +146,7 @@ class Step:
             text = f'{thing} seems to have moved slowly, {size} over the session{of}'
             if self.kind == 'joint':
                 more += '; the correction is now off by half of that: see why, and measure again'
-            more += '; if the poses follow an order, errors of the arm may look so: mix them'
+            more += '; if the poses follow an order, arm errors may look like this: mix them'
         elif self.kind in OF_THE_ARM:
             text, more = f'{thing} changed before {self._where}', f': poses differ {size}'
         if self.kind == 'load':
@@ -163,7 +163,7 @@ class Step:
             more += f'; errors of {self.turned} may look so, as it moved just there: mix poses'
         elif self.apart:
             more += (
-                '; errors of the arm may look so, as poses before and after lie apart: mix them'
+                '; arm errors may look like this, as poses before and after lie apart: mix them'
             )
         return Reason(Rule.ENCODER if self.kind.startswith('joint') else Rule.MOVED, text, more)
 

@@ -33,7 +33,7 @@ def other_order(
     rows = np.arange(len(seen))
     if problem.of_messages or not FEWEST_ROWS <= len(rows) <= MOST_SEARCHED:
         return None
-    what = 'the joint values stand in the reverse order of the measurements'
+    what = 'the joint values are in the reverse order of the measurements'
     orders = [('', rows), (what, rows[::-1])]
     for first in (1, 0):
         text = np.array(sorted(rows.tolist(), key=lambda k: str(k + first)))

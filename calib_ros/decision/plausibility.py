@@ -142,8 +142,8 @@ def _another_type(problem: Problem, result: Identification) -> str:
     zeros = {joint.driven for joint in problem.chain.joints}
     far = [p.name for p in result.parameters if p.beyond(most, np.inf) and p.name not in zeros]
     return bool(far) * (
-        f'{", ".join(some(far))} further than {1e3 * most:g} mm from nominal: is the chain that '
-        'of the arm measured (type, size and generation)?'
+        f'{", ".join(some(far))} further than {1e3 * most:g} mm from nominal: does the chain '
+        'match the arm (type, size and generation)?'
     )
 
 
@@ -278,7 +278,7 @@ def _stop_lag(problem: Problem, result: Identification) -> tuple[str, Problem | 
     return (
         f'poses lie towards the previous stop, which explains {100.0 * share:.0f} % of the '
         'residuals: the device smooths, stamps are late, or the arm creeps. Set settle to the '
-        'time until measurements rest, and stop for longer'
+        'settling time, and stop for longer'
     ), late
 
 

@@ -75,8 +75,8 @@ class Region(Shown):
             return 'valid over the whole joint range'
         if guessed := [joint.name for joint in self.chain.joints if joint.guessed]:
             return (
-                'valid near the measured poses; how far is not known, because the chain file has '
-                f'no limits of {", ".join(guessed)}'
+                'valid near the measured poses; how far is unknown, because the chain file has no '
+                f'limits for {", ".join(guessed)}'
             )
         share = f'{min(100.0 * self.share, 99.0):.0f}' if self.share >= 0.01 else 'under 1'
         return (

@@ -23,9 +23,9 @@ from calib_ros.kinematics.se3 import FloatArray
 Turn: TypeAlias = Callable[[FloatArray], FloatArray]
 ORDERS = tuple(map(''.join, permutations('XYZ')))
 BACKWARDS = (
-    'the Euler angles stand in the opposite order',
-    'of r1, r2, r3 reverse the letters of --euler, and small for capital (xyz for ZYX); of rx, '
-    'ry, rz exchange the first and the last turn',
+    'the Euler angles are in the opposite order',
+    'for r1, r2, r3 reverse the letters of --euler and change their case (xyz for ZYX); for rx, '
+    'ry, rz swap the first and the last turn',
 )
 VECTOR = ''  # "Order" of a rotation vector
 
@@ -43,7 +43,7 @@ def misread() -> Iterator[tuple[str, str, Turn]]:
             what, turn = f'the Euler angles are {_order(meant)}', _reinterpret(read, meant, meant)
             yield f'{what}, not {_order(read)}', f'--euler {meant}{so}', turn
             what += f' in the order of their columns, not {_order(read)}'
-            remedy = f'--euler {meant} --columns {now} (if so called){so}'
+            remedy = f'--euler {meant} --columns {now} (if so named){so}'
             yield what, remedy, _reinterpret(read, meant, read)
         turn = _reinterpret(read, VECTOR, 'XYZ')
         yield f'the angles are rotation vectors, not {angles}', f'--rotation-vector{so}', turn

@@ -91,7 +91,7 @@ def _of_poses(chain: Chain, seen: Observations) -> Iterator[Suspect]:
         what, remedy = NOT_ON_FLANGE if seen.seen else ON_FLANGE
         yield Suspect(what, remedy, BACK, published=_in_sources(not seen.seen))
     yield from _of_coordinates(seen)
-    remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
+    remedy = 'flip one of them, --columns y=-y (for poses qx=-qx,qz=-qz as well)'
     what = 'the axes of the measuring device are left-handed'
     yield Suspect(what, remedy, (mirrored,), 3, part='handed')
 
@@ -117,7 +117,7 @@ def _arm_mistakes(chain: Chain, sets: Sets) -> Iterator[Suspect]:
 def rows_away(rows: int) -> str:
     """Return that joint values stand some rows below their measurement, or above it."""
     count, where = counted(abs(rows), 'row'), 'below' if rows > 0 else 'above'
-    return f'the joint values stand {count} {where} their measurement'
+    return f'the joint values are {count} {where} their measurement'
 
 
 def _of_boards(chain: Chain, seen: Observations) -> Iterator[Suspect]:

@@ -140,7 +140,7 @@ def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
     with unpacked_files(path) as folder, closing(_opened(path, folder)) as reader:
         found = {c.topic: c for c in reader.connections if c.msgtype in PICTURES}
         if topic and topic not in found:
-            raise UnknownNameError(f'topic of images in {path}', topic, found)
+            raise UnknownNameError(f'{path}: image topic', topic, found)
         if len(found) != 1 and not topic:
             names = ', '.join(found) or ' or '.join(PICTURES)
             problem = 'several topics of images, choose one with --topic' if found else 'no'

@@ -81,7 +81,7 @@ class Columns:
             remedy += ', or its decimal point as a comma' * (self.decimal == ',')
         if commas := DECIMAL_COMMA.fullmatch(bare) is not None:
             told = f'; if these are thousands, {remedy}' * bool(THOUSANDS.fullmatch(bare))
-            remedy = f'write a point or, of measurements, give --decimal comma{told}'
+            remedy = f'write a point or (measurements) give --decimal comma{told}'
         if bare.split(' [')[0] == called.split(' [')[0]:  # the header again, but not the same
             remedy = 'other columns or units begin there: split the file above that line'
         cut = re.fullmatch(r'[^a-z]*[0-9.] ?(\D+)', bare, re.I)
@@ -122,8 +122,8 @@ class Columns:
 
     def joint_values(self, names: Sequence[str]) -> FloatArray:
         """Return the numbers (N, len(names)) of joints beside measurements."""
-        told = 'must not be empty: each row needs joint values beside what was measured; of '
-        told += 'recordings keep one row for each stop with both, or give a bag'
+        told = 'must not be empty: each row needs joint values beside what was measured; '
+        told += 'keep one row of a recording for each stop, or give a bag'
         self.refuse(self.blank(names[0]), f'{names[0]} {told}')
         return self.block(names)
 
@@ -262,7 +262,7 @@ def _rows_below(
                 refuse_separator(path, header)
                 raise ColumnsError(
                     f'{path}, line {line}: more values than the {width} columns of its '
-                    'header; remove other lines above that (of measurements: calib_ros import)'
+                    'header; remove other lines above that (measurements: calib_ros import)'
                 )
             del cells[width:]
         count += len(block)

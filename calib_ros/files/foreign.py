@@ -113,7 +113,7 @@ class Foreign:
             like = like_joints(log.names, count)
             advice = option(like or ('q*',), like.values() or ('NAME*',))
             if not like:
-                advice += ' (of a program, write its joint values to a table: a row for each pose)'
+                advice += ' (program: write its joint values to a table, a row for each pose)'
             advice = f'give {advice} or --joints-preset'
             raise InputError(f'{log.path} has no column q1; {log.has}: {advice}')
         matched, partners = _partners(table, log)
@@ -126,8 +126,8 @@ class Foreign:
             raise InputError(
                 f'{log.path} has {len(joints.lines)} rows, {table.path} has {len(made.lines)}: '
                 'give both a column that names the poses, or a row for each measurement (rows '
-                'without values do not count). Times are not interpolated: of recordings keep one '
-                'row for each stop, or record both in a bag'
+                'without values do not count). Times are not interpolated: keep one row for each '
+                'stop, or record both in a bag'
             )
         joints = joints.select(partners)
         for ours in filter(re.compile('q[0-9]+').fullmatch, joints.cells):

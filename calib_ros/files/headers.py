@@ -35,7 +35,7 @@ from calib_ros.files.vocabulary import (
 )
 from calib_ros.shown import some
 
-SEVERAL_POINTS = '; of several points give one, or a row for each, named in a column target'
+SEVERAL_POINTS = '; give one of several points, or a row for each, named in a column target'
 OTHER_ARM = 'Is it another arm (--chain)? '
 OF_ABB = 'If q1 to q4 are a quaternion, give the joint values (--joints FILE). '
 TURNS_LEFT = 'rx, ry, rz are left out: give --euler or --rotation-vector to use them'

@@ -57,7 +57,7 @@ def _require_size(path: Path, content: Mapping[str, Any], found: Detections) -> 
     if what:
         raise InputError(
             f'{path} is of images of {size[0]:g} x {size[1]:g} px, the corners {what}: give the '
-            'intrinsics of the camera as it took these images'
+            'intrinsics for these images'
         )
 
 

@@ -98,7 +98,7 @@ def table(
         except ColumnsError as err:
             if not path.is_file():
                 raise InputError(
-                    f'{err}; of a pipe nothing is guessed, it is read once: save it as a file, or '
+                    f'{err}; a pipe is read once, so nothing is guessed: save it as a file, or '
                     'give an option for tables, such as --separator'
                 ) from err
         foreign = Foreign(Layout(), chain)

@@ -96,7 +96,7 @@ def _program(found: Columns, chain: Chain) -> tuple[Columns, tuple[str, ...], Fl
     kinds = (ANGLES if joint.type == 'revolute' else LENGTHS for joint in chain.joints)
     units = _units(found, dict(zip(columns, kinds, strict=True)))
     how = '; values are in rad or m, or in the unit named there: q1 [deg]'
-    how += '; of a Fanuc q3 = J3 + J2' * ('J3' in header)
+    how += '; Fanuc: q3 = J3 + J2' * ('J3' in header)
     require_rows(found, needed(columns), how)
     if {more, more.upper()} & {*header}:
         raise InputError(

@@ -56,7 +56,7 @@ def select_rows(found: Columns, joints: int, sessions: Sequence[str]) -> Measure
         if name in sessions[:k]:
             raise InputError(f'session "{name}" is named twice')
         if name not in known:
-            raise UnknownNameError(f'session in {found.path}', name, known)
+            raise UnknownNameError(f'{found.path}: session', name, known)
     wanted = [known.index(name) for name in sessions or known]
     rows = np.concatenate([np.flatnonzero(numbers == place) for place in wanted])
     every = np.array_equal(rows, np.arange(len(found.lines)))

@@ -18,7 +18,7 @@ from calib_ros.texts import LARGEST_TABLE
 LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
 WITH_FORMULA = re.compile(rb'<(\w+:)?f[ />]')
 WITH_HIDDEN = re.compile(rb'<(\w+:)?row [^>]*\bhidden="(1|true)"')
-READ_HIDDEN = 'rows that are hidden or filtered out are read, too: delete those that do not count'
+READ_HIDDEN = 'hidden and filtered rows are read too: delete those that do not count'
 
 
 def sheets_of(path: Path, name: str) -> Iterator[tuple[str, list[str], list[Cells]]]:

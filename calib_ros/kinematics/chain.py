@@ -118,7 +118,7 @@ class Chain(Shown):
             object.__setattr__(self, 'parallel', self._joining(nearly_parallel))
         for name in self.parallel or ():
             if name not in names:
-                raise UnknownNameError('joint in "parallel"', name, names)
+                raise UnknownNameError('"parallel": joint', name, names)
             if (self.parallel or ()).count(name) > 1:
                 raise ConfigError(f'"parallel" names joint "{name}" twice')
 

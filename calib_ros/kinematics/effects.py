@@ -133,7 +133,7 @@ def resolve(chain: _Arm, name: str) -> tuple[str, ...]:
             raise ConfigError(f'model {name} stands alone: no effects can be joined to it')
         if '.' not in name:
             raise UnknownNameError('model', name, (*alone, *GROUPS))
-        raise UnknownNameError(f'joint in effect {name}', joint, chain.joint_names)
+        raise UnknownNameError(f'effect {name}: joint', joint, chain.joint_names)
     check_effect(name, chain.joint_names)
     if kind in PLAY and name not in (known := members(chain, 'backlash')):
         raise UnknownNameError('effect', name, known)
@@ -146,14 +146,14 @@ def check_effect(name: str, joints: tuple[str, ...]) -> None:
     first, rest = Parameter(name).effect
     if first in ('coupling', 'gravity'):
         if rest not in joints:
-            raise UnknownNameError(f'joint in effect {name}', rest, joints)
+            raise UnknownNameError(f'effect {name}: joint', rest, joints)
     elif first in WAVES:
         try:
             known = np.isfinite(float(rest))
         except ValueError:
             known = False
         if not known:
-            raise UnknownNameError(f'harmonic in effect {name}', rest, ('1', '2', '...'))
+            raise UnknownNameError(f'effect {name}: harmonic', rest, ('1', '2', '...'))
     elif first not in ('ratio', 'compliance', *PLAY) or rest:
         raise UnknownNameError('effect', name, GROUPS)
 

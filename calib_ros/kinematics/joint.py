@@ -55,7 +55,7 @@ class Joint:
         if not self.name or '.' in self.name:
             raise ConfigError(f'a joint needs a name without dots, not "{self.name}"')
         if self.type not in get_args(JointType):
-            raise UnknownNameError(f'type of joint "{self.name}"', self.type, get_args(JointType))
+            raise UnknownNameError(f'joint "{self.name}": type', self.type, get_args(JointType))
         if self.sign not in (1, -1):
             raise ConfigError(f'sign of joint "{self.name}" must be 1 or -1, not {self.sign}')
         for kind in ROW_KINDS:

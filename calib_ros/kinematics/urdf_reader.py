@@ -76,11 +76,11 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
     kind = element.get('type', '')
     where = f'joint "{name}"'
     if kind not in JOINT_TYPES:
-        raise UnknownNameError(f'type of {where}', kind, JOINT_TYPES)
+        raise UnknownNameError(f'{where}: type', kind, JOINT_TYPES)
     parent, child = (child_of(element, key).get('link', '') for key in ('parent', 'child'))
     for link in (parent, child):
         if link not in links:
-            raise UnknownNameError(f'link at {where}', link, links)
+            raise UnknownNameError(f'{where}: link', link, links)
     axis = np.zeros(3)
     if kind in MOVING_TYPES:
         axis = numbers_of(child_of(element, 'axis'), 'xyz', f'axis of {where}', '1 0 0')

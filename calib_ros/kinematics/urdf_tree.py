@@ -95,7 +95,7 @@ class Description:
             passed.append(master.name)
             name, times, more = master.follows
             if name not in known:
-                raise UnknownNameError(f'joint that "{master.name}" mimics', name, known)
+                raise UnknownNameError(f'joint "{master.name}": mimicked joint', name, known)
             if name in passed or not times:
                 raise ConfigError(f'joint "{joint.name}" mimics itself, or another times zero')
             master, ratio, offset = known[name], ratio * times, offset + ratio * more

@@ -51,7 +51,7 @@ def plan_report(
             predicted = f'Predicted RMS position error: {rounded(1e3 * found.accuracy[-1])} mm.'
             verdict = replace(verdict, text=(*verdict.text, predicted))
         steps = (
-            'Check for collisions, drive to each pose, wait until the arm is still, and measure.',
+            'Check for collisions, move to each pose, wait until the arm is still, and measure.',
             'Then identify: calib_ros identify.',
         )
         if found.lacking or not known:

@@ -338,7 +338,7 @@ def _determined(result: Identification) -> Section:
         'What the poses determine',
         'Expected error of positions predicted over the whole joint range: '
         f'{rounded(sigma["median"])} mm (median), {rounded(sigma["max"])} mm (largest), without '
-        "what does not show: errors below half of the device's noise, and its scale.",
+        "what residuals hide: errors below half the device's noise, and its scale.",
         f'Observability indices: {words.observability_in_words(result)}; the larger, the better. '
         'From the singular values of the Jacobian, in stated sigmas per metre or radian: O1 is '
         'their geometric mean divided by the square root of the number of poses, O2 the smallest '

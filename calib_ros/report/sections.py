@@ -140,7 +140,7 @@ def outliers(poses: Poses) -> Section:
         'They differ from the others by more than this arm and device explain: little or no '
         'weight in the fit, none in the figures. Measure them again, or find out what happened.'
         f'{more}',
-        head=('from', 'residual [usual errors]', 'error after [mm]'),
+        head=('from', 'residual/typical error', 'error after [mm]'),
         rows=tuple(
             (poses.source(k), size, rounded(after[k]))
             for k in rows[:50].tolist()

@@ -17,7 +17,7 @@ from calib_ros.report.poses import Poses
 from calib_ros.report.reports import NOT_YET, bring
 from calib_ros.shown import rounded, sentence
 
-STAYS = 'the arm is unchanged within the uncertainty: the correction that it has stays valid'
+STAYS = 'the arm is unchanged within the uncertainty: its correction stays valid'
 PREDICTED = '"Before": by the earlier calibration; "after": predicted from the other new poses.'
 
 

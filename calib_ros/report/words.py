@@ -131,10 +131,10 @@ def notes(result: Identification) -> list[str]:
     if partly := error_meaning(result):
         found.append(partly)
     if result.weak:
-        found.append(f'hardly determined, held near nominal by priors: {", ".join(result.weak)}')
+        found.append(f'held near nominal by priors: {", ".join(some(result.weak))}')
     weak = [name for name in weakly_determined(result) if name not in result.weak]
     if weak:
-        found.append(f'weakly determined: {", ".join(weak)}')
+        found.append(f'weakly determined: {", ".join(some(weak))}')
     return found
 
 
@@ -147,8 +147,8 @@ def error_meaning(result: Identification) -> str:
     position = result.comparison.after.position
     if (np.abs(position[:, 0]) > SAME)[~position[:, 1:].any(axis=1)].any():
         return (
-            'errors of distances and touched planes are along one direction: position errors in '
-            'space are about 1.7 times as large if alike in all directions'
+            'errors of distances and touched planes are along one direction: in space they are '
+            'about 1.7 times as large if equal in all directions'
         )
     words = 'the error of a corner is the shortest shift in space that explains its pixels'
     return words if result.images else ''
@@ -228,7 +228,7 @@ def verdict_in_words(found: Judgement) -> str:
             )
         return f'too few poses to tell whether the calibration holds: {told}; measure more'
     turned = turned_in_words(now)
-    near = '; this is told only near these poses' * bool(found.near)
+    near = '; this holds only near these poses' * bool(found.near)
     return f'the calibration holds: {told}{near}' + f'; but {turned}' * bool(turned)
 
 
@@ -309,7 +309,7 @@ NEIGHBOURS = {'successive': 'measured in succession', 'near': 'near each other i
 def neighbours_in_words(noise: Noise) -> str:
     """Return which neighbours share errors, their size and consequence."""
     if not noise.shared:
-        return 'No test finds errors shared by neighbouring poses.'
+        return 'No errors shared by neighbouring poses were found.'
     parts = [f'{NEIGHBOURS[kind]} ({getattr(noise, kind):.2f})' for kind in noise.shared]
     text = (
         f'Poses {" and ".join(parts)} have similar errors (correlation in brackets): '
@@ -324,7 +324,7 @@ def chance_in_words(chance: float) -> str:
     """Return how well drift explains the gain."""
     share = f'{100.0 * chance:.1f}' if chance >= 0.001 else 'less than 0.1'
     return (
-        f'Shifted to the wrong poses, errors can be corrected just as well in {share} % of cases: '
+        f'Errors shifted to the wrong poses can be corrected just as well in {share} % of cases: '
         f'above {100.0 * (1.0 - CONFIDENT):.0f} % the improvement may only be drift of the device.'
     )
 

@@ -209,7 +209,7 @@ class Inputs:
                 qos_overriding_options=QoSOverridingOptions(policies, callback=checked),
             )
         except RuntimeError as err:  # unknown policy
-            raise ConfigError(f'qos_overrides for "{stream.topic}" cannot be: {err}') from err
+            raise ConfigError(f'invalid qos_overrides for "{stream.topic}": {err}') from err
         return subscription, (stream, hearing)
 
     def _subscribe_to_latched(self) -> None:
@@ -307,7 +307,7 @@ class Batched(Node):  # type: ignore[misc]  # see pyproject.toml
                 if message.clock.sec >= 0:
                     times.callback(message)
                     continue
-                words = f'negative times on {CLOCK_TOPIC} are not used, {message.clock.sec} s say'
+                words = f'negative times on {CLOCK_TOPIC} are ignored ({message.clock.sec} s)'
                 self.get_logger().warning(words, once=True)
 
 

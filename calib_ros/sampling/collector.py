@@ -233,7 +233,7 @@ class Collector:
         if not stopped or newest - self._begin(stands) < shortest:
             return 0, (
                 f'the arm has not been still for {self.settings.shortest_stop:g} s yet '
-                f'(no joint further than {self.settings.still:g} rad or m)'
+                f'(joints within {self.settings.still:g} rad or m)'
             )
         if not (self.waiting.count or place):
             return 0, 'no measurements since the last pose'

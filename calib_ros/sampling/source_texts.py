@@ -35,7 +35,7 @@ def parse_source(text: str, types: Mapping[str, str] | None = None) -> Source:
     for pair in pairs:
         key, equals, value = pair.partition('=')
         if not equals or key not in SOURCE_KEYS:
-            raise UnknownNameError(f'key of source "{text}"', key, SOURCE_KEYS)
+            raise UnknownNameError(f'source "{text}": key', key, SOURCE_KEYS)
         if key in ('eye_in_hand', 'validation'):
             if value not in ('true', 'false'):
                 raise ConfigError(f'{key} of source "{text}" must be true or false, not "{value}"')

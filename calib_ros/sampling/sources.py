@@ -35,7 +35,7 @@ class Source:
 
     def __post_init__(self) -> None:
         if self.type and self.type not in TYPES:
-            raise UnknownNameError(f'type of source "{self.topic}"', self.type, TYPES)
+            raise UnknownNameError(f'source "{self.topic}": type', self.type, TYPES)
         frames = {self.parent, self.child} - {''}
         if len(frames) != (2 if self.type in LINKS else 0):
             raise ConfigError(
@@ -48,7 +48,7 @@ class Source:
                 f'{_or(PICTURES)}, and only then'
             )
         if self.lens not in LENSES:
-            raise UnknownNameError(f'lens of source "{self.topic}"', self.lens, LENSES)
+            raise UnknownNameError(f'source "{self.topic}": lens', self.lens, LENSES)
         for name in (self.device, self.target):
             if '.' in name or ',' in name:
                 raise ConfigError(f'a device or target needs a name without . and , not "{name}"')

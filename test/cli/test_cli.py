@@ -392,5 +392,5 @@ def test_an_unchanged_arm_needs_no_other_correction(run, written, tmp_path, move
     status, out, _ = run('identify', 'new.csv', '--chain', 'ur5e', '--previous', written[0])
     assert status == 0
     assert ('Changed: base' in out) == (moved > 0.0)
-    assert 'the correction that it has stays valid' in ' '.join(out.split())
+    assert 'its correction stays valid' in ' '.join(out.split())
     assert 'calib_ros export' not in out

@@ -132,7 +132,7 @@ def test_the_help_of_a_command(shown, name):
         (('bag2csv', 'bag', 't.csv', '--chain', 'ur5e', '--xyz=3'), 'unknown option "--xyz"\n'),
         (('workspace', *UR5E, '--calibration=c'), '"--calibration": give RESULT first, without'),
         (('robots', 'ur5e'), 'unexpected argument "ur5e"\n'),
-        (('identify', 'a.csv', 'b.csv', *UR5E), 'make one table, with a column session (or'),
+        (('identify', 'a.csv', 'b.csv', *UR5E), 'join several files in one table, with'),
         (('chain',), 'required: ROBOT'),
         (('identify', 'measured.csv'), '--chain (calib_ros robots lists the arms supplied)'),
         (('verify', 'a.csv', '--tolerance', '0,2'), "in the unit of --help, not '0,2'"),

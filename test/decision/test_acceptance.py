@@ -279,7 +279,7 @@ def test_joints_that_come_from_one_side_are_told_with_their_play(sign, times, gi
     size = f'{1e3 * times * EXCEPTION * usual:.2g}'
     assert found == told * (
         f'elbow_joint (± {size} mrad) moved to all poses from the same side, which hides play: '
-        'expected errors include as much as is likely. Approach poses from both sides to measure '
+        'expected errors include its likely size. Approach poses from both sides to measure '
         'it; if the same side is also used later, it does no harm: --model backlash --priors '
         '"*.backlash=1e-6"'
     )

@@ -39,8 +39,8 @@ def test_a_late_joint_is_brought_back_to_where_it_was():
     late = moved - moved[2]  # they share that of the device
     np.testing.assert_allclose(late[:5], [0.0, -4e-3, 0.0, 0.0, 0.0], rtol=0, atol=4e-4)
     assert re.fullmatch(
-        r'joints late by different times explain 9\d % of the residuals, above all '
-        r'shoulder_lift_joint: read all joints at one moment, unfiltered, look for wrong speeds, '
+        r'joints with different delays explain 9\d % of the residuals, above all '
+        r'shoulder_lift_joint: read all joints at once, unfiltered, look for wrong speeds, '
         r'or stop at each pose \(mode dwell\)',
         text,
     )

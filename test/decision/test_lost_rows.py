@@ -25,9 +25,9 @@ from calib_ros.kinematics.se3 import exp_rotation
 @pytest.mark.parametrize(
     ('positions', 'joints', 'oriented', 'said'),
     [
-        ([9], [-1], True, 'from line 11 on the joint values stand 1 row below'),
-        ([-2, -1], [21, 22], True, 'from line 22 on the joint values stand 2 rows above'),
-        ([35, 36], [0, 1], False, 'before line 38 the joint values stand 2 rows above'),
+        ([9], [-1], True, 'from line 11 on the joint values are 1 row below'),
+        ([-2, -1], [21, 22], True, 'from line 22 on the joint values are 2 rows above'),
+        ([35, 36], [0, 1], False, 'before line 38 the joint values are 2 rows above'),
     ],
 )
 def test_rows_lost_in_one_of_two_tables_are_named(positions, joints, oriented, said):
@@ -71,7 +71,7 @@ def test_rows_lost_before_the_first_and_again_later_are_not_told_as_one():
 @pytest.mark.parametrize(
     ('order', 'oriented', 'said'),
     [
-        (np.arange(40)[::-1], True, 'stand in the reverse order of the measurements'),
+        (np.arange(40)[::-1], True, 'are in the reverse order of the measurements'),
         (sorted(range(40), key=str), False, 'joint values are sorted as text (0, 1, 10 ...)'),
         ([int(k) - 1 for k in sorted(map(str, range(1, 41)))], True, 'as text (1, 10, 1'),
         (np.argsort(sorted(range(40), key=str)), False, 'measurements are sorted as text (0, 1, '),
@@ -95,7 +95,7 @@ def test_rows_of_joint_values_in_another_order_are_named(order, oriented, said):
 def test_no_several_mistakes_at_once_explain_another_order():
     *_, seen = measured_arm(1, 40, oriented=False)
     found = diagnose(Problem(UR10E, replace(seen, joints=seen.joints[::-1])))
-    assert str(found).startswith('the joint values stand in the reverse order')
+    assert str(found).startswith('the joint values are in the reverse order')
 
 
 @pytest.mark.parametrize('k', range(6))

@@ -87,7 +87,7 @@ SPOILT = {
     ),
     'Euler columns': (
         lambda e: replace(e, rotations=_in_turn(e.rotations)),
-        '--euler ZYX --columns r1=rx,r2=ry,r3=rz (if so called)',
+        '--euler ZYX --columns r1=rx,r2=ry,r3=rz (if so named)',
     ),
     'vectors': (rewritten('XYZ', ''), '--rotation-vector'),
     'no vectors': (rewritten('', 'XYZ'), '--euler XYZ'),

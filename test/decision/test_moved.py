@@ -48,13 +48,13 @@ ZERO = replace(FRAME, owners=('wire',), kind='zero', thing='the device', longer=
         (
             replace(FRAME, slow=True, longer=WIRES, unused=FROM_THERE),
             'the device seems to have moved slowly, by 1.2 mm over the session (base); if the '
-            'poses follow an order, errors of the arm may look so: mix them; measurements from '
+            'poses follow an order, arm errors may look like this: mix them; measurements from '
             'there on carry no weight',
             'base seems to move slowly, by 1.2 mm in all: mix the order of poses',
         ),
         (
             replace(FRAME, apart=True),
-            'the device moved by 1.2 mm (base) before row 5; errors of the arm may look so, as '
+            'the device moved by 1.2 mm (base) before row 5; arm errors may look like this, as '
             'poses before and after lie apart: mix them',
             f'base moved by 1.2 mm before pose 7{AGAIN}',
         ),
@@ -73,7 +73,7 @@ ZERO = replace(FRAME, owners=('wire',), kind='zero', thing='the device', longer=
             replace(JOINT, slow=True),
             'the zero of elbow_joint seems to have moved slowly, by 1.2 mrad over the session; '
             'the correction is now off by half of that: see why, and measure again; if the poses '
-            'follow an order, errors of the arm may look so: mix them',
+            'follow an order, arm errors may look like this: mix them',
             'the zero of elbow_joint seems to move slowly, by 1.2 mrad in all: mix the order of '
             'poses',
         ),
@@ -81,7 +81,7 @@ ZERO = replace(FRAME, owners=('wire',), kind='zero', thing='the device', longer=
             replace(JOINT, slow=True, spoils=True),
             'the zero of elbow_joint seems to have moved slowly, by 1.2 mrad over the session; '
             'the correction is now off by half of that: see why, and measure again; if the poses '
-            'follow an order, errors of the arm may look so: mix them',
+            'follow an order, arm errors may look like this: mix them',
             f'the zero of elbow_joint seems to move slowly, by 1.2 mrad in all: see why{AGAIN}',
         ),
         (

@@ -120,7 +120,7 @@ def test_a_rail_without_limits_is_not_known_to_its_end(rng):
     seen = measure(faulty(rail, Cell(), rng), q, rng, 5e-5, 2e-4)
     found = identify(Problem(endless, seen))
     assert found.accepted
-    assert 'no limits of linear_axis_joint' in summary(found)
+    assert 'no limits for linear_axis_joint' in summary(found)
     q = np.repeat(q, 2, axis=0)
     q[1::2, 0] = 10.0
     assert found.region.covers(q).tolist() == [True, False] * 60

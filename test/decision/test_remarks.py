@@ -49,7 +49,7 @@ def test_lengths_of_another_type_are_told(joint, off, unsearched):
     rng = np.random.default_rng(0)
     seen = measure(rail.with_offsets({name: off}), rail.random_joints(60, rng), rng, 1e-4, 3e-4)
     result = identify(Problem(replace(rail, base=None, tool=None), seen))
-    told = [each for each in result.remarks if 'is the chain that of' in each]
+    told = [each for each in result.remarks if 'does the chain match' in each]
     assert bool(told) == (joint > 0 and off > 0.01)
     assert all(each.startswith(f'{name} further than 10 mm from nominal') for each in told)
 

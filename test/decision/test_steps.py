@@ -280,7 +280,7 @@ def test_blocks_of_poses_in_different_places_are_said(rng, aside, size, said):
     seen = moved(measure(true, q, rng, *NOISE), true, 'base', size)
     step = step_of(seen)
     assert step.sample == AT
-    assert ('errors of the arm may look so' in str(step)) == said
+    assert ('arm errors may look like this' in str(step)) == said
 
 
 def test_poses_of_several_targets_are_told_by_their_lines():

@@ -49,7 +49,7 @@ RANKS = {
     'the chain file gives a wrong base and tool (fixed: true)': (3, ''),
     'the coordinates x, y, z of the positions are -x, y, z': (3, 'measured'),
     'the coordinates x, y, z of the positions are y, z, x': (2, 'measured'),
-    'the joint values stand 2 rows above their measurement': (2, ''),
+    'the joint values are 2 rows above their measurement': (2, ''),
 }
 
 

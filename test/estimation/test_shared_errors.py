@@ -114,7 +114,7 @@ def test_the_report_says_what_is_shared_and_what_follows():
         if parameter['std'] is not None:
             assert parameter['half_width_95'] > 1.95 * parameter['std']
     _, quiet = run(9, identified=identify)
-    assert 'No test finds errors' in neighbours_in_words(quiet.noise)
+    assert 'No errors shared' in neighbours_in_words(quiet.noise)
 
 
 def drawn(rng, count=20, width=4):

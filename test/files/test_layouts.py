@@ -123,7 +123,7 @@ def test_what_is_no_expression(text):
         ),
         (
             ['q1', 'q2', *(f'{a}{k}' for k in (1, 2) for a in 'xyz')],
-            'of several points give one, or a row for each, named in a column target',
+            'give one of several points, or a row for each, named in a column target',
         ),
         (['0.1', '-2', '3', '4e-5', '5'], '--columns "q1=#1,q2=#2,x=#3,y=#4,z=#5", in its order'),
     ],

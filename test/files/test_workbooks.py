@@ -150,4 +150,4 @@ def test_hidden_rows_are_told(tmp_path, hidden):
     book.save(tmp_path / 'cell.xlsx')
     table = read_table(tmp_path / 'cell.xlsx', 2, foreign=Foreign(Layout()))
     assert_same(table, None)
-    assert ('hidden or filtered out are read' in str(table.warnings)) == hidden
+    assert ('hidden and filtered rows are read' in str(table.warnings)) == hidden

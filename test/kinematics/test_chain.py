@@ -147,8 +147,8 @@ ONE = row_of((HALF, 0.0), 'standard')
         (lambda: ONE.with_effects(['j3.ratio']), 'unknown parameter "j3.ratio"'),
         (lambda: ONE.value('j3.a'), 'unknown parameter "j3.a"'),
         (lambda: ONE.frame('base_2'), 'unknown frame "base_2": .*valid: base, tool'),
-        (lambda: replace(ONE, parallel=('j3',)), 'unknown joint in "parallel" "j3"'),
-        (lambda: Joint('j', 'screw'), 'unknown type of joint "j" "screw": valid: '),
+        (lambda: replace(ONE, parallel=('j3',)), '"parallel": unknown joint "j3"'),
+        (lambda: Joint('j', 'screw'), 'joint "j": unknown type "screw": valid: '),
         (
             lambda: Joint('j', lower=2.0, upper=1.0),
             'limits of joint "j": lower 2.0 must not exceed upper 1.0',

@@ -40,5 +40,5 @@ def test_outliers_held_out_are_listed_too(unsearched):
         (table,) = (each for each in report.sections if each.name == 'outliers')
         assert table.title == f'Outliers: {1 + fitted} of {TRAIN + TEST} poses'
         assert [row[1] for row in table.rows][fitted:] == ['held out']
-        assert table.head[1] == 'residual [usual errors]'  # along one axis: a usual pose has 1.5
+        assert table.head[1] == 'residual/typical error'  # along one axis: a usual pose has 1.5
         assert [float(row[2]) > 10.0 for row in table.rows] == [True] * (1 + fitted)

@@ -101,7 +101,7 @@ def test_without_motion_there_is_no_delay():
 
 @pytest.mark.parametrize(
     ('jitter', 'smoothing', 'said'),
-    [(0.0, 0.0, ''), (0.05, 0.0, 'stamps jitter'), (0.0, 0.05, 'at one moment, unfiltered')],
+    [(0.0, 0.0, ''), (0.05, 0.0, 'stamps jitter'), (0.0, 0.05, 'at once, unfiltered')],
 )
 def test_errors_of_time_are_told(jitter, smoothing, said):
     """In motion they pass for errors of the arm, and an arm without any may look better for it."""

@@ -44,9 +44,9 @@ def test_the_last_name_of_the_topic_tells_what_judges_unless_it_is_said(text, ju
     ('texts', 'said'),
     [
         (['', '   ', 'device=left', 'type=PoseStamped /pose'], 'must begin with its topic'),
-        (['/x devise=left', '/x left', '/x =left'], 'unknown key of source'),
+        (['/x devise=left', '/x left', '/x =left'], 'unknown key'),
         (['/x devise=left'], 'did you mean "device"'),
-        (['/x type=Pose'], 'unknown type of source "/x"'),
+        (['/x type=Pose'], 'source "/x": unknown type'),
         (['/x eye_in_hand=', '/x eye_in_hand=1', '/x validation=True'], 'must be true or false'),
         (['/x device=a.b', '/x device=a,b', '/x target=a.b'], r'without \. and ,'),
         (

@@ -209,7 +209,7 @@
     roles && ['used', (i) => e.roles[e.role[i]] + (e.outlier[i] ? ', outlier' : '')],
     e.oriented && ['before [mrad]', (i) => fixed(floats.turned_before[i])],
     e.oriented && ['after [mrad]', (i) => fixed(floats.turned_after[i])],
-    sized && ['residual [usual errors]', (i) => fixed(floats.size[i], 1)],
+    sized && ['residual/typical error', (i) => fixed(floats.size[i], 1)],
     ...e.joints.map((name, k) => [`${name} [${e.show[k][1]}]`, (i) => fixed(floats.joints[n * i + k] * e.show[k][0], e.show[k][2])]),
   ].filter(Boolean);
   const isNumber = ([title]) => title !== 'used';
