@@ -229,7 +229,7 @@ def test_lengths_that_are_one_multiple_ask_for_the_unit(unsearched):
     inches = Problem(UR10E, replace(seen, positions=25.4 * seen.positions))
     turned = replace(seen, joints=np.add(seen.joints, [0.0, 0.3, 0.0, 0.25, 0.0, 0.0]))
     held = Problem(UR10E, turned, fixed=('*.a', '*.d'))
-    for problem, said in ((inches, 'all lengths come out 25.4 times as long'), (held, 'off by')):
+    for problem, said in ((inches, 'all lengths come out 25.4 times as long'), (held, 'further')):
         reasons = identify(problem).refusals
         (far,) = [str(each) for each in reasons if each.rule is Rule.COMMON_SENSE]
         assert far.startswith(said)

@@ -282,7 +282,7 @@ def test_a_pipe_in_another_form_is_told_to_be_saved():
     os.write(begin, b'q1;q2;x;y;z\n0;0;1;2;3\n')
     os.close(begin)
     arm = Chain('arm', 'standard', (Joint('a'), Joint('b')))
-    with pytest.raises(InputError, match=r'by semicolons: .* it is read once: save it'):
+    with pytest.raises(InputError, match=r'by semicolons: .* a pipe is read once, .*: save it'):
         loading.table(Path(f'/dev/fd/{end}'), arm, Settings())
     os.close(end)
 

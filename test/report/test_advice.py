@@ -205,7 +205,7 @@ def test_what_moved_is_told_with_the_steps_of_what_was_measured():
     ('needless', 'told', 'silent'),
     [
         (('no_images', 'no_wires'), 'the column session', ('--places', 'draw-wire')),
-        (('images', 'no_wires'), 'of --places', ('session', 'draw-wire')),
+        (('images', 'no_wires'), 'the --places table', ('session', 'draw-wire')),
         (('no_images',), 'draw-wire', ('--places',)),
     ],
 )
