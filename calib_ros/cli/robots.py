@@ -37,8 +37,8 @@ def _chain(options: argparse.Namespace, screen: Screen) -> int:
         chain = chain_file.read_urdf(path, **given)
         frames = chain_file.chain_document(chain)
         text = chain_file.dump_chain(replace(chain, base=None, tool=None))
-        text += '# Known in the URDF: take a line in where the device measures in the base link,\n'
-        text += '# or the tip link itself. Without it that frame is found from the poses.\n'
+        text += '# From the URDF: uncomment a line if the device measures in the base link,\n'
+        text += '# or the tip link itself; otherwise the frame is found from the poses.\n'
         for key in ('base', 'tool'):
             text += f'# {key}: {json.dumps(frames[key] | {"fixed": True})}\n'
     else:

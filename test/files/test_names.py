@@ -48,7 +48,7 @@ def test_columns_of_a_table_without_a_header_are_proposed_by_their_numbers(tmp_p
     with pytest.raises(InputError, match='names: --columns "x=#2,y=#3,z=#4", in its order'):
         read_table(path, 2, foreign=Foreign(Layout(), ARM, log, layouts[0]))
     log.write_text(3 * 'p={0.1,-0.2,0.5,9}\n')  # #2 and #3 are not q1 and q2
-    with pytest.raises(InputError, match=r'give --columns "q\*=NAME\*" \(of a program, write its'):
+    with pytest.raises(InputError, match=r'give --columns "q\*=NAME\*" \(program: write its'):
         read_table(path, 2, foreign=Foreign(layouts[1], ARM, log))
 
 

@@ -74,9 +74,9 @@ def test_a_topic_of_another_type_is_told(cell):
     ('policy', 'value', 'said'),
     [
         ('reliability', 'often', 'often'),
-        ('reliability', 'unknown', 'qos_overrides for "joint_states" cannot be'),
+        ('reliability', 'unknown', 'invalid qos_overrides for "joint_states"'),
         ('history', 'sometimes', 'sometimes'),
-        ('history', 'unknown', 'qos_overrides for "joint_states" cannot be'),
+        ('history', 'unknown', 'invalid qos_overrides for "joint_states"'),
         ('depth', 0, 'must be >= 1'),
         ('depth', -1, 'must be >= 1'),  # it was told as an invalid allocator
         ('reliabilty', 'reliable', r'did you mean .*/joint_states.subscription.reliability'),
