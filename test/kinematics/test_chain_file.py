@@ -153,7 +153,7 @@ WRONG = [
     ('convention:', 'konvention:', '"konvention": did you mean "convention"'),
     ('quat_xyzw:', 'quat:', 'base: unknown key "quat": did you mean "quat_xyzw"'),
     ('convention: standard', 'convention: standart', '"standart": did you mean "standard"'),
-    ('type: revolute', 'type: revolut', '"joint_1" "revolut": did you mean "revolute"'),
+    ('type: revolute', 'type: revolut', '"joint_1": unknown type "revolut": did you'),
     ('a: 0.0', 'a: .nan', 'joint 1: a must be a finite number, not nan'),
     ('d: 0.1273', 'd: twelve', "joint 1: d must be a finite number, not 'twelve'"),
     ('d: 0.1273', 'd: pi/2', "joint 1: d must be .*, not 'pi/2': write it out, such as 1.5708"),
