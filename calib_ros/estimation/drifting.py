@@ -28,7 +28,7 @@ from calib_ros.estimation.levels import SEVERAL, UNUSUAL
 from calib_ros.estimation.quadratic_forms import PartRows
 from calib_ros.estimation.samples import gram
 from calib_ros.estimation.stops import Stops
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.values import SAME
 
 DRIFT_KERNELS = [('successive', length) for length in (*DECAYS['successive'], 300.0)]
@@ -44,10 +44,11 @@ def device_drift(part: PartRows, units: Stops) -> FloatArray | None:
     None unless the device drifts. Averages over all sizes and lengths: a session tells little of
     a drift that lasts longer.
     """
+    highest = -np.inf
 
     @cache
     def one(kind: str, length: float) -> tuple[FloatArray, FloatArray]:
-        return likelihoods(part, units.kernel(kind, length))
+        return likelihoods(part, units.kernel(kind, length), highest)
 
     def likely(kernels: Sequence[tuple[str, float]]) -> tuple[FloatArray, FloatArray]:
         pairs = [one(*each) for each in kernels]
@@ -78,31 +79,38 @@ def together(units: Stops, lengths: Sequence[int], sizes: FloatArray) -> float:
     return float(1.0 + 2.0 * pairs[1:] @ shares[1:] ** 2 / pairs[0])
 
 
-def likelihoods(part: PartRows, kernel: FloatArray) -> tuple[FloatArray, FloatArray]:
+def likelihoods(
+    part: PartRows, kernel: FloatArray, rival: float = -np.inf
+) -> tuple[FloatArray, FloatArray]:
     """Return log likelihoods (R,) against independent errors alone, and sizes (2, R).
 
     The sizes of the independent part and of the kernel K (n, n), for ratios g, each with the most
-    likely v.
+    likely v. From the middle up, then down, until falling likelihoods are nothing (-inf) beside
+    the largest, or that of a `rival`.
     """
     basis, residual, known, shares = part
     rows = np.concatenate([basis, residual[:, :, np.newaxis]], axis=2)
-    ratios, width = np.geomspace(0.02, 50.0, 12), rows.shape[2]
-    products, logs = np.zeros((len(ratios), width, width)), np.zeros(len(ratios))
+    ratios, width, alike = np.geomspace(0.02, 50.0, 12), rows.shape[2], []
     for seen in np.unique(known, axis=1).T:
-        alike = (known == seen[:, np.newaxis]).all(axis=0)
+        which = (known == seen[:, np.newaxis]).all(axis=0)
         values, axes = np.linalg.eigh(kernel * np.outer(seen, seen))
-        weights = 1.0 / (1.0 + np.outer(ratios, np.maximum(values, 0.0)))
-        turned = axes.T @ rows[:, alike].reshape(len(rows), -1)
-        logs -= alike.sum() * np.log(weights).sum(axis=1)
-        roots = np.sqrt(weights)[:, :, np.newaxis]
-        products += [gram((root * turned).reshape(-1, width).T) for root in roots]
+        turned = axes.T @ rows[:, which].reshape(len(rows), -1)
+        alike.append((which.sum(), np.maximum(values, 0.0), turned))
     count, others = known.sum(), np.eye(width - 1) - shares
     moved, free = np.einsum('ncp,nc->p', basis, residual), count - np.trace(shares)
     alone = (residual**2).sum() / free
     sizes = alone / (1.0 + ratios * np.diag(kernel).mean())
-    likely = count * np.log(alone) - logs + free
-    for k, (product, squares) in enumerate(zip(products, products[:, -1, -1], strict=True)):
-        own, along = product[:-1, :-1].copy(), product[:-1, -1]
+    likely, middle = np.full(len(ratios), -np.inf), len(ratios) // 2
+    for k in (*range(middle, len(ratios)), *reversed(range(middle))):
+        best, last = likely.max(), likely[k - 1 if k > middle else k + 1]
+        if last < min(best, max(best, rival) + np.log(ROUNDING)):
+            continue
+        product, twice = np.zeros((width, width)), count * np.log(alone) + free
+        for number, values, turned in alike:
+            weights = 1.0 / (1.0 + ratios[k] * values)
+            twice += number * np.log(weights).sum()
+            product += gram((np.sqrt(weights)[:, np.newaxis] * turned).reshape(-1, width).T)
+        own, along, squares = product[:-1, :-1].copy(), product[:-1, -1], product[-1, -1]
         for left in reversed(range(1 + SEVERAL)):
             ratio = alone / sizes[k]
             matrix = own * ratio + others  # symmetric: as Fortran has it, without a copy
@@ -115,6 +123,6 @@ def likelihoods(part: PartRows, kernel: FloatArray) -> tuple[FloatArray, FloatAr
             taken = 2.0 * np.vdot(inverse.T, own) - np.diag(inverse) @ np.diag(own)
             squared = squares - 2.0 * shift @ along + shift @ own @ shift
             sizes[k] = squared / max(count - ratio * taken, 1.0)
-        likely[k] -= count * np.log(sizes[k]) + 2.0 * np.log(np.diag(factor)).sum()
-        likely[k] += shift @ vector / alone - squares / sizes[k]
-    return 0.5 * likely, np.array([sizes, ratios * sizes])
+        twice -= count * np.log(sizes[k]) + 2.0 * np.log(np.diag(factor)).sum()
+        likely[k] = 0.5 * (twice + shift @ vector / alone - squares / sizes[k])
+    return likely, np.array([sizes, ratios * sizes])

@@ -59,6 +59,9 @@ def test_likelihoods_are_those_of_generalised_least_squares():
         for other in (0.9, 1.1):  # the sizes are the most likely of their ratio, nearly
             less = log_likelihood(block_diag(other * noise, rest)) - alone
             assert less < expected + 0.1
+    fewer, _ = likelihoods(part, kernel, rival=found.max() + 100.0)  # only up to the peak
+    assert fewer.max() == found.max()
+    assert 2 <= np.isfinite(fewer).sum() < len(found)
 
 
 @pytest.mark.parametrize('order', ['path', 'random'])
