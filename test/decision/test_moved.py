@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from fits import NOISE, SIGMAS, UR10E, arm
 
-from calib_ros import Problem, identify
-from calib_ros.apply.simulation import measure
+from calib_ros import Problem, identify, load_chain
+from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.moved import ASIDE, BEFORE_THAT, FROM_THERE, IF_IN_ORDER, Step
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.steps import find_step
@@ -223,3 +223,13 @@ def test_another_robot_is_no_joint_that_slipped_between_two_sessions(slip, said)
     result = identify(Problem(UR10E, first, more=(second,), **SIGMAS))
     assert result.step.kind.startswith('joint')
     assert said in result.refusals[0]
+
+
+def test_a_move_whose_size_hardly_shows_is_not_told():
+    """Of a device that was frozen at six stops: "the device moved by 0 mm (base)"."""
+    fr3, rng = load_chain('franka_fr3'), np.random.default_rng(4)
+    true = faulty(fr3, Cell(), rng)
+    seen = measure(true, true.random_joints(36, rng), rng, 2e-5, 1e-4, oriented=False)
+    last = [*range(16), *[15] * 5, *range(21, 36)]
+    frozen = replace(seen, positions=seen.positions[last])
+    assert find_step(fitting.fit(Problem(fr3, frozen, sigma_position=2e-5))) is None
