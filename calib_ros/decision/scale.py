@@ -13,22 +13,20 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.levels import CERTAIN, LARGEST_SCALE, SCALE
 from calib_ros.estimation.problem import Problem
-
-HARMFUL = 0.15
-"""Probability of harm by the device's scale at which a result is refused: of 630 good ones 23 are;
-of 1,890 arms with a scale of 0.1 to 0.3 % 59 are accepted and get worse (benchmarks/scale.py)."""
+from calib_ros.settings import EXCEPTION
 
 
 def scale_reasons(problem: Problem, result: Identification) -> Iterator[Reason]:
     """Yield that a device out of scale does harm or is too likely to, if nothing else refuses.
 
-    Also if its scale was checked, but almost certainly is not what `sigma_scale` states.
+    One in ten is too likely (benchmarks/scale.py). Also if its scale was checked, but almost
+    certainly is not what `sigma_scale` states.
     """
     region, found = result.region, result.posterior
     if result.refusals or region is None:
         return
     certain = problem.sigma_scale and found.rival and special.expit(found.rival[0]) > CERTAIN
-    if region.by_scale >= HARMFUL or certain:
+    if region.by_scale >= EXCEPTION or certain:
         length = stated_length(problem)
         text = out_of_scale(found.scale, length, strain=found.strain)
         if problem.sigma_scale:
