@@ -32,6 +32,7 @@ from calib_ros.estimation.levels import CLEARLY, CONFIDENT
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.orientations import with_known_turns
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import Index
 from calib_ros.settings import Settings
@@ -129,7 +130,9 @@ def judge(
     without a covariance; None that of the earlier device, or more if the errors show it. `chain`
     is the calibrated arm in refitted frames.
     """
-    found = found or along_base(compare(arm.before, arm.chain, sets), arm.chain, sets)
+    if found is None:
+        sets = with_known_turns(arm, sets)
+        found = along_base(compare(arm.before, arm.chain, sets), arm.chain, sets)
     moments = moments_of(found.after.position, found.before.configurations)
     rms, numbers, freedom, lower, upper = limits_of(moments, lost, confidence, DECIDING)
     angle = 1e-3 * (found.figures[1].rms_mrad or 0.0)

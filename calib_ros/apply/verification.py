@@ -25,6 +25,7 @@ from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.visits import frames_of_sets
 from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.orientations import with_known_turns
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.joint import Frame
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index
@@ -62,6 +63,7 @@ def verify(
     """
     fitted = frames_of_sets(sets, new_base, new_tool)
     _check(arm, sets, fitted)
+    sets = with_known_turns(arm, sets, fitted)
     comparison, left, uncorrected, chain = by_both_arms(arm, sets, commanded, fitted)
     progress(2 / 3)
     whole = 'tool' if all(each.seen for each in sets) else 'base'

@@ -24,6 +24,7 @@ from calib_ros.files.loading import Loaded, load_bag, load_table
 from calib_ros.files.result_rows import result_row
 from calib_ros.identification.age import refuse_older, years_since
 from calib_ros.identification.calibration import Calibration, calibration_file
+from calib_ros.identification.orientations import turns_left_out
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.recalibration import recalibrate
 from calib_ros.kinematics.chain import Chain
@@ -90,11 +91,13 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         serial = previous.serial_of(str(options.previous), options.serial)
         known = {'robot_serial': serial} if serial else {}
         previous = replace(previous, record={**previous.record, **known})
+        problem = loaded.between(previous.frames_of(loaded.owners))
+        left_out = turns_left_out(previous, problem.all_sets)
+        loaded = replace(loaded, warnings=(*loaded.warnings, *left_out))
         for warning in loaded.warnings:
             screen.warn(warning)
-        refuse_older(previous.record, loaded.problem.all_sets)
-        years = years_since(previous.record, loaded.problem.all_sets)
-        problem = loaded.between(previous.frames_of(loaded.owners))
+        refuse_older(previous.record, problem.all_sets)
+        years = years_since(previous.record, problem.all_sets)
         new = frames_of_sets(problem.all_sets, options.new_base, options.new_tool)
         with screen.work('looking for what has changed'):
             stated = [name for name in problem.sigmas if vars(options).get(name)]

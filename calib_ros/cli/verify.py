@@ -19,6 +19,7 @@ from calib_ros.estimation.levels import ALIKE
 from calib_ros.files.programs import read_joints
 from calib_ros.files.result_rows import verification_row
 from calib_ros.identification.calibration import calibration_file
+from calib_ros.identification.orientations import turns_left_out
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
@@ -54,7 +55,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         with screen.work('judging') as work:
             given = confidence, moved[0], commanded, moved[1], work, sigma
             found = verify(arm, sets, tolerance, *given)
-        for warning in read.warnings:
+        warnings = (*read.warnings, *turns_left_out(arm, sets, found.fitted))
+        for warning in warnings:
             screen.warn(warning)
         if options.json:
             screen.data(dump_json(verification_document(found)))
@@ -65,7 +67,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             with screen.work('writing the report') as work:
                 poses = poses_to_verify(found.chain, sets, found.comparison, read.by_line)
                 origin = inputs.origin_of(options, files, serial=serial)
-                report = verification_report(arm.chain, found, poses, origin, read.warnings)
+                report = verification_report(arm.chain, found, poses, origin, warnings)
                 contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
                 contents['report.md'] = markdown(report, {})
                 contents |= inputs.page_of(options, report, screen)

@@ -45,6 +45,7 @@ from calib_ros.estimation.weights import OUTLIER
 from calib_ros.identification.age import drift_of, recorded_time
 from calib_ros.identification.calibration import Calibration, about, provenance
 from calib_ros.identification.fingerprint import Fingerprint
+from calib_ros.identification.orientations import with_known_turns
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
@@ -71,6 +72,8 @@ def recalibrate(
     calibration has no covariance or lacks a frame, or for a mistake.
     """
     previous.require_frames(problem.all_sets)
+    judging = problem.held_out and with_known_turns(previous, problem.judging)
+    problem = problem.with_sets(with_known_turns(previous, problem.sets), held_out=judging)
     previous = _released(previous, new)
     ours = [name for name in new if name in problem.chain.frame_names]
     problem = replace(problem, chain=reframed(problem.chain, ours, fixed=False))
@@ -124,19 +127,16 @@ def _moved_far(
 
 def _released(previous: Calibration, new: Sequence[str]) -> Calibration:
     """Return a calibration whose new frames are not fixed where they were."""
-    region = previous.region
-    if region is not None:
+    if (region := previous.region) is not None:
         region = replace(region, chain=reframed(region.chain, new, fixed=False))
-    arms = previous.chain, previous.before
-    chain, before = (reframed(each, new, fixed=False) for each in arms)
+    chain, before = (reframed(x, new, fixed=False) for x in (previous.chain, previous.before))
     return replace(previous, chain=chain, before=before, region=region)
 
 
 def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Problem]]:
     """Yield set and pose with the largest errors by a chain, and the problem without it."""
     sets = problem.all_sets
-    sizes = [norms(residuals(chain, each).position) for each in sets]
-    order = np.argsort(-np.concatenate(sizes))
+    order = np.argsort(-np.concatenate([norms(residuals(chain, s).position) for s in sets]))
     if not len(order) >= IN_A_FRAME or any(each.pixels is not None for each in sets):
         return
     places = [(number, pose) for number, each in enumerate(sets) for pose in range(len(each))]
