@@ -325,8 +325,8 @@ def _step_of(scan: Scan, found: _Found, number: int) -> Step | None:
     """Return one of the steps with its first sample and effect; None for a large slow motion."""
     group, problem = found.group, scan.problem
     place, offsets = found.stops[number], found.sizes[number]
-    if not offsets.any():
-        return None  # only gross errors tell it, as of a frozen device
+    if found.variance > 1.0 and not offsets.any():
+        return None  # gross errors tell it, but not all of them: a frozen device, perhaps
     sets = [scan.sets[k] for k in group.sets]
     after = [scan.numbers[k] >= place for k in group.sets]
     stamp, of_set, sample = min(

@@ -97,7 +97,7 @@ def test_a_planar_arm_is_corrected_in_its_plane_and_the_rest_is_told(nominal):
         idle = np.linalg.svd(moved)[2][:, 3:]
         share = np.einsum('nki,ni->nk', idle, result.correction)
         assert np.abs(share).max(initial=0.0) < 1e-4
-    told = f'{1e3 * np.abs(after[:, 2]).max():.3f} mm are left, which no joint can correct'
+    told = f'{1e3 * np.abs(after[:, 2]).max():.3f} mm are left that no joint can correct'
     assert told in in_words(compensator, result)
     strict = compensate(replace(compensator, largest_position_error=1e-5), q)
     assert 'this arm cannot reach every pose' in strict.refusals[0].reason
@@ -111,7 +111,7 @@ def test_of_errors_in_the_plane_nothing_is_left_across_it():
     q = 0.95 * nominal.random_joints(200, np.random.default_rng(0))
     result = compensate(compensator, q[np.abs(np.sin(q[:, 1])) > 0.3])
     assert 0.0 < result.position.max() < EXACT
-    assert ' 0.000 mm are left, which no joint can correct' in in_words(compensator, result)
+    assert ' 0.000 mm are left that no joint can correct' in in_words(compensator, result)
 
 
 def test_a_planar_arm_stretched_out_is_singular():
