@@ -142,8 +142,21 @@ def _diagnosed(problem: Problem, sets: Sets, far: bool) -> Diagnosis | None:
             or _beam_search(problem, chain, given)
             or _named(problem, given, tried, inexact=True)
             or _of_tables(problem, chain, sets, given, orders.other_order, largest)
+            or _beyond_reach(problem, given)
         )
     return found and _for_messages(problem, replace(found, where=where + found.where))
+
+
+def _beyond_reach(problem: Problem, given: Trial) -> Diagnosis | None:
+    """Return that the positions are in another unit, whatever else is wrong with them."""
+    for each in given.sets:
+        beyond = '' if each.inverse or each.socket else problem.beyond_reach(each.positions)
+        if beyond:
+            remedy = 'are they in mm (--length mm)? Something else is wrong as well'
+            asked = 'are they in mm? Something else is wrong as well'
+            suspect = Suspect(f'the positions {beyond}', remedy, published=asked)
+            return Diagnosis((suspect,), given.error, np.nan)
+    return None
 
 
 def _for_messages(problem: Problem, found: Diagnosis) -> Diagnosis:

@@ -133,18 +133,8 @@ class Problem(Shown):
 
         By their quartiles: some may be gross errors, or of an endless axis.
         """
-        reach, doubts = TOOL, []
-        for joint in self.chain.joints:
-            reach += joint.apart + abs(joint.d)
-            if joint.type == 'prismatic':
-                ends = joint.lower, joint.upper
-                reach += max(np.inf if end is None else abs(end) for end in ends)
-        spread = float(np.ptp(np.percentile(distances, (25.0, 75.0)))) if len(distances) else 0.0
-        if spread > 2.0 * reach:
-            doubts.append(
-                f'the distances vary by {spread:.3g} m, more than an arm of {reach - TOOL:.3g} m '
-                'can cause: are they in metres (--length)?'
-            )
+        beyond = self.beyond_reach(distances[:, np.newaxis])
+        doubts = [f'the distances {beyond}: are they in metres (--length)?'] if beyond else []
         turns = np.abs(joints[:, [joint.type != 'prismatic' for joint in self.chain.joints]])
         if turns.size and np.median(np.percentile(turns, 75.0, axis=0)) > 2.0 * np.pi:
             doubts.append(
@@ -153,6 +143,22 @@ class Problem(Shown):
             )
         if doubts:
             raise InputError(' Also, '.join(doubts))
+
+    def beyond_reach(self, values: FloatArray) -> str:
+        """Return that most values (N, K) [m] vary by more than the flange can move, or nothing."""
+        reach = sum(joint.apart + abs(joint.d) for joint in self.chain.joints)
+        for joint in self.chain.joints:
+            if joint.type == 'prismatic':
+                ends = joint.lower, joint.upper
+                reach += max(np.inf if end is None else abs(end) for end in ends)
+        spread = (
+            np.ptp(np.percentile(values, (25.0, 75.0), axis=0), axis=0).max()
+            if len(values)
+            else 0.0
+        )
+        return bool(spread > 2.0 * (reach + TOOL)) * (
+            f'vary by {spread:,.4g} m, more than an arm of {reach:.3g} m can cause'
+        )
 
     def _check_patterns(self) -> None:
         for pattern in (*self.fixed, *self.priors):

@@ -282,3 +282,12 @@ def test_errors_larger_than_those_of_faulty_arms_are_suspicious(what, largest, n
         )
         problem = SimpleNamespace(**limits, sets=())
         assert mistakes._suspicious(problem, result) == (share > 1.0)
+
+
+@pytest.mark.parametrize(('of_messages', 'unit'), [(False, 'mm (--length mm)'), (True, 'mm')])
+def test_another_unit_is_named_whatever_else_is_wrong(of_messages, unit):
+    """Millimetres in reversed rows: "RMS 975,599 mm remains", or a move of 2.6e+06 mm."""
+    _, _, seen = measured_arm(1, 30, oriented=False)
+    wrong = replace(seen, positions=1e3 * seen.positions, joints=seen.joints[::-1].copy())
+    found = diagnose(Problem(UR10E, wrong, of_messages=of_messages))
+    assert f'more than an arm of 1.78 m can cause: are they in {unit}? ' in str(found)
