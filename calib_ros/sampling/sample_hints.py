@@ -93,8 +93,9 @@ def frozen(samples: Sequence[Sample]) -> Hint | None:
         and count_distinct(configurations(np.array([each.joints for each in some]))) > 1
         for each in some
     }
-    still = {id(each) for each in measured if each.count > 1 and not round(each.spread, 12)}
-    if START <= len(still) <= len(measured) - START:  # else a simulation
+    several = [each for each in measured if each.count > 1]
+    still = {id(each) for each in several if not round(each.spread, 12) and _fine(each)}
+    if START <= len(still) <= len(several) - START:  # else a simulation
         repeated |= still
     if len(repeated) < START:
         return None
@@ -104,3 +105,9 @@ def frozen(samples: Sequence[Sample]) -> Hint | None:
         f'{len(repeated)} poses repeat a position to the last digit, such as {where} m (does the '
         'device see the target and send live data?): measure again (node: ~/clear first)',
     )
+
+
+def _fine(each: Sample) -> bool:
+    """Tell whether a position has digits beyond 10 um: else noise may not show."""
+    assert each.position is not None
+    return bool((each.position.round(9) != each.position.round(5)).any())

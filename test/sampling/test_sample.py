@@ -11,6 +11,7 @@ from calib_ros.kinematics.chain_file import parse_frames
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.dataset import dataset_of
 from calib_ros.sampling.sample import Frames, Sample, View
+from calib_ros.sampling.sample_hints import frozen
 
 SIGMAS = (1e-4, 3e-4)
 PLAIN = Sample(1, np.zeros(2), position=np.ones(3), rotation=np.eye(3))
@@ -135,3 +136,20 @@ def test_images_become_corners_unless_the_poses_of_their_boards_are_asked_for():
     samples[1] = replace(samples[1], view=replace(images[1], lens=replace(lens, k1=0.1)))
     with pytest.raises(InputError, match='CameraInfo of eye has changed'):
         dataset_of(samples, SIGMAS)
+
+
+@pytest.mark.parametrize(
+    ('every', 'digits', 'fewest', 'told'),
+    [(1, 9, 9, False), (2, 9, 9, True), (6, 9, 9, False), (2, 5, 9, False), (1, 9, 1, False)],
+)
+def test_stops_at_which_the_last_place_was_repeated_are_told(every, digits, fewest, told, rng):
+    """By a device without a target, another place each time; nothing scatters in a simulation.
+
+    Nor at some stops by a device of few digits, and one measurement shows no scatter.
+    """
+    places = rng.uniform(size=(30, 3)).round(digits)
+    spreads = [1e-5 * (k % every > 0) for k in range(30)]
+    counts = [9 - (9 - fewest) * (k % 2) for k in range(30)]
+    stops = zip(places, spreads, counts, strict=True)
+    given = [replace(PLAIN, position=p, spread=s, count=c) for p, s, c in stops]
+    assert (frozen(given) is not None) == told

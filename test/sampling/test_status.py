@@ -356,15 +356,6 @@ def test_poses_that_do_not_follow_the_arm_are_told():
     assert '22 poses repeat a position to the last digit, such as 0, 0, 0 m' in made.warnings[0]
 
 
-@pytest.mark.parametrize(('every', 'told'), [(1, False), (2, True), (6, False)])
-def test_stops_at_which_the_last_place_was_repeated_are_told(every, told):
-    """By a device without a target, another place each time; nothing scatters in a simulation."""
-    spreads = [0.0 if k % every == 0 else 1e-5 for k in range(30)]
-    given = zip(samples(30), spreads, strict=True)
-    made = session([replace(each, count=9, spread=spread) for each, spread in given])
-    assert ('poses repeat a position: is the device frozen?' in made.status()) == told
-
-
 def test_the_status_is_never_an_error():
     only_judging = session(samples(10, validation=True))
     assert '; 0 poses' in only_judging.status()
