@@ -161,4 +161,7 @@ def _covariance(made: Columns, axes: FloatArray | None) -> FloatArray | None:
 
 def _sizes(made: Columns, names: Sequence[str]) -> FloatArray:
     """Return standard deviations (N, len(names)); blank ones are not stated: 0."""
-    return np.nan_to_num(made.numbers(names))
+    found = np.nan_to_num(made.numbers(names))
+    wrong = found.any(axis=1) & ~(found > 0.0).all(axis=1)
+    made.refuse(wrong, f'{", ".join(names)} must be positive, or all blank')
+    return found

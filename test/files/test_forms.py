@@ -209,6 +209,11 @@ def test_standard_deviations_beside_our_own_columns(guessed, path, names):
     np.testing.assert_allclose(found.covariance, expected, atol=1e-18)
     with pytest.raises(InputError, match='has standard deviations: calib_ros import'):
         read_table(path, 2)
+    for wrong in (-2e-3, np.nan):
+        sizes[2, 1] = wrong
+        text = text_of(JOINTS, PLACES, quat, sizes, names=['q1', 'q2', *POSE_COLUMNS, *names])
+        with pytest.raises(InputError, match='line 4: sx, sy, sz must be positive, or all blank'):
+            guessed(text)
 
 
 def test_rotation_matrices(guessed, path):
