@@ -190,11 +190,14 @@ def looks_alike(problem: Problem, owner: str) -> str:
     if owner != joint.name or len({getattr(each, kind) for each in problem.sets}) > 1:
         return ''
     how = 'turned about' if joint.type == 'revolute' else 'slid along'
-    return f'{thing_of(kind, problem.sets[0])} {how} the axis of this joint'
+    return f'{thing_of(kind, problem.sets[0], bodily=True)} {how} the axis of this joint'
 
 
-def thing_of(kind: str, seen: Observations, several: bool = False) -> str:
-    """Return what moves with a frame, or with several alike, in words; `kind` as in `Step`."""
+def thing_of(kind: str, seen: Observations, several: bool = False, bodily: bool = False) -> str:
+    """Return what moves with a frame, or with several alike, in words; `kind` as in `Step`.
+
+    Only what moves `bodily`, without what seems to as the device's zero or clock does.
+    """
     if kind not in IN_THE_CELL:
         return OF_THE_ARM.get(kind, 'the joint')
     of_images = seen.pixels is not None
@@ -206,6 +209,7 @@ def thing_of(kind: str, seen: Observations, several: bool = False) -> str:
         device += ['its zero']
     elif seen.moving:  # early or late is elsewhere
         device += ['its clock']
+    device = device[:1] if bodily else device
     on_flange, other = (device, target) if seen.inverse or seen.on_flange else (target, device)
     other = [f'{other[0]}s'] if several else other
     *first, last = on_flange if kind == 'tool' else [*other, "the robot's foot"]
