@@ -308,25 +308,25 @@ def _drifts(scan: Scan, found: _Found) -> bool:
 
 
 def _described(scan: Scan, found: _Found, quiet: bool) -> Step | None:
-    """Return a step with later ones of the same group, or None for a large slow motion.
+    """Return a step with later ones of the same group, or None if none is to be told.
 
     Residuals without gross errors are `quiet` if all samples kept are from one place.
     """
-    steps = [_step_of(scan, found, k) for k in range(len(found.stops))]
-    first, last = steps[0], steps[-1]
-    if first is None or last is None or first is last:
-        return first
-    after, before = FROM_THERE in first.unused, BEFORE_THAT in last.unused
+    every = (_step_of(scan, found, k) for k in range(len(found.stops)))
+    steps = [*filter(None, every)]
+    if len(steps) < 2:
+        return next(iter(steps), None)
+    after, before = FROM_THERE in steps[0].unused, BEFORE_THAT in steps[-1].unused
     unused = FROM_THERE * after or BEFORE_THAT * before or ASIDE * quiet
-    return replace(first, later=tuple(filter(None, steps[1:])), unused=unused)
+    return replace(steps[0], later=tuple(steps[1:]), unused=unused)
 
 
 def _step_of(scan: Scan, found: _Found, number: int) -> Step | None:
-    """Return one of the steps with its first sample and effect; None for a large slow motion."""
+    """Return one of the steps with its first sample and effect, or None if it is not told."""
     group, problem = found.group, scan.problem
     place, offsets = found.stops[number], found.sizes[number]
-    if found.variance > 1.0 and not offsets.any():
-        return None  # gross errors tell it, but not all of them: a frozen device, perhaps
+    if not offsets.any() and found.share < 1.0 - EXCEPTION:
+        return None  # gross errors tell it, but no move explains those of a frozen device
     sets = [scan.sets[k] for k in group.sets]
     after = [scan.numbers[k] >= place for k in group.sets]
     stamp, of_set, sample = min(

@@ -3,6 +3,7 @@
 """What moved during the session, in whole sentences."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from fits import NOISE, SIGMAS, UR10E, arm
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision import steps
 from calib_ros.decision.moved import ASIDE, BEFORE_THAT, FROM_THERE, IF_IN_ORDER, Step
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.steps import find_step
@@ -233,3 +235,8 @@ def test_a_move_whose_size_hardly_shows_is_not_told():
     last = [*range(16), *[15] * 5, *range(21, 36)]
     frozen = replace(seen, positions=seen.positions[last])
     assert find_step(fitting.fit(Problem(fr3, frozen, sigma_position=2e-5))) is None
+
+
+def test_a_move_beside_one_whose_size_hardly_shows_is_told(monkeypatch):
+    monkeypatch.setattr(steps, '_step_of', lambda scan, found, k: (None, FRAME)[k])
+    assert steps._described(None, SimpleNamespace(stops=(3, 9)), False) == FRAME
