@@ -86,9 +86,14 @@ class Step:
 
     @property
     def _size(self) -> str:
-        """Return the size in words; only of several with its sign; large angles in degrees."""
+        """Return the size in words; only of several with its sign; large angles in degrees.
+
+        Zero if only gross errors tell it.
+        """
         size = math.remainder(self.size, 2.0 * math.pi) if self.unit == 'rad' else self.size
         size = size if self.later else abs(size)
+        if not self.size:
+            return 'by an unknown amount'
         if self.unit == 'rad' and abs(size) > Settings.largest_angle:
             return f'by {math.degrees(size):.0f}°'
         return f'by {two_digits(1e3 * size)} m{self.unit}'

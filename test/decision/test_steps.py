@@ -127,6 +127,7 @@ def test_a_step_of_simulated_measurements_without_noise_is_all_that_is_left():
     step = step_of(moved(seen, true, 'tool', 1e-3))
     assert (step.what, step.sample) == ('tool', AT)
     assert step.share == pytest.approx(1.0)
+    assert str(step).startswith('the target moved by an unknown amount (tool)')  # said: 0 mm
 
 
 @pytest.mark.parametrize(('seed', 'at'), [(3, 25), (6, 19)])
