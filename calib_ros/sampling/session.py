@@ -239,24 +239,24 @@ class CalibrationSession:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return warnings about the measurements."""
-        return tuple(hint.text for hint in self._hints(self.samples))
+        return tuple(hint.text for hint in self._hints(frozen(self.samples)))
 
     @property
     def last_hints(self) -> list[Hint]:
         """Return what looks wrong in a motion that has ended; before it may still stop."""
-        return self._hints(self.samples) or self._pipeline.unstopped(len(self.samples))
+        return self._hints(frozen(self.samples)) or self._pipeline.unstopped(len(self.samples))
 
     @property
     def hints(self) -> list[Hint]:
         """Return what looks wrong in the received messages; of a frozen device, if it is now."""
-        return self._hints(self.samples[-NO_ACCIDENT:])
+        return self._hints(frozen(self.samples[-NO_ACCIDENT:]) and frozen(self.samples))
 
-    def _hints(self, recent: Sequence[Sample]) -> list[Hint]:
+    def _hints(self, stuck: Hint | None) -> list[Hint]:
         in_sockets = self.settings.mode == 'triggered' and self.received  # perhaps: not measured
         found = [] if self.samples or in_sockets else unheard(self.received)
         if words := self._different:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}', explains=False))
-        found += [hint] if frozen(recent) and (hint := frozen(self.samples)) else []
+        found += [stuck] if stuck else []
         found += self._names.silent_ones(self._collector.track.silent())
         found += self._pipeline.hints(self.received[POSES])
         found += spoilt(self.samples, found)
