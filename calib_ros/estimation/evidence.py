@@ -170,13 +170,13 @@ class _Columns:
     def evidence(self, scale: float | None = None, alone: bool = False) -> Evidence:
         """Return the evidence; with another usual `scale` of the device that nobody checked.
 
-        Of that `alone`, or also of its strains.
+        Of that `alone`, while its strains are usual, or also of these.
         """
         far = self.scale if scale is None else scale
-        typical = TYPICAL | {'scale': self.scale if alone else far}
-        known = [self._checked if alone or scale is None else 0.0] * self._device
+        typical = TYPICAL | {'scale': far}
+        known = [self._checked if scale is None else 0.0] * self._device
         if alone:
-            known[-1] = far
+            known[:-1] = [self._checked or self.scale] * len(STRAINS)
         groups = self._groups + [None if each else 'scale' for each in known]
         given = np.array(self._given + [each or np.inf for each in known])
         return Evidence(*self.normal, given**-2.0, groups, typical)

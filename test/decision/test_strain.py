@@ -156,15 +156,22 @@ def test_linear_joints_do_not_hide_that_a_strained_device_may_harm(seed, size):
         assert 'one direction' in refusal
 
 
-@pytest.mark.parametrize('seed', [0, 5, 7])
-def test_linear_joints_do_not_hide_a_scale_alike_in_all_directions(seed):
+@pytest.mark.parametrize(
+    ('seed', 'scale', 'said'),
+    [
+        (0, 1.002, 'grow alike, by 0.2'),
+        (5, 1.002, 'grow alike, by 0.2'),
+        (3, 0.97, 'shrink alike, by 3 %'),
+    ],
+)
+def test_linear_joints_do_not_hide_a_scale_alike_in_all_directions(seed, scale, said):
     """Strains near zero contradicted it: these SCARAs were accepted and got worse."""
     rng, true = np.random.default_rng(seed), arm(seed, chain=SCARA)
     seen = measure(true, SCARA.random_joints(50, rng), rng, *NOISE)
-    seen = replace(seen, positions=1.002 * seen.positions)
+    seen = replace(seen, positions=scale * seen.positions)
     (refusal,) = identify(Problem(SCARA, seen, **SIGMAS)).refusals
     assert refusal.rule is Rule.SCALE
-    assert refusal.startswith('all lengths of the arm grow alike, by 0.2')
+    assert refusal.startswith(f'all lengths of the arm {said}')
 
 
 @pytest.mark.parametrize(('seed', 'scale'), [(0, 1.0), (1, 1.0), (0, 1.002), (1, 0.998)])
