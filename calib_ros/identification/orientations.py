@@ -54,4 +54,5 @@ def _unknown(arm: Calibration, sets: Sequence[Observations], new: Sequence[str])
     ends = {each.base if each.inverse else each.tool for each in sets if each.oriented.any()}
     turns = FRAME_KINDS[3:]
     fitted = {name.owner for name in map(Parameter, arm.names) if name.kind in turns}
-    return {n for n in ends - fitted if n not in new and not arm.chain.frame(n).fixed}
+    fixed = {name for name, frame in arm.chain.all_frames.items() if frame and frame.fixed}
+    return ends - fitted - fixed - {*new}
