@@ -94,7 +94,8 @@ class Inference:
         rival, device, checked = None, np.zeros(1), bool(fitted.problem.sigma_scale)
         if columns.scaled and fitted.held is None and (checked or columns.scale < PRINTED):
             far = max(OUT_OF_SCALE, columns.scale)
-            rivals = [columns.evidence(far, alone) for alone in (False, True)[: 1 + strained]]
+            ways = ('', *('strains', 'scale') * strained)
+            rivals = [columns.evidence(far, sized) for sized in ways]
             against = (r.odds_against(evidence, size, columns.considered) for r in rivals)
             odds, mean, covariance = max(against, key=lambda each: each[0])
             # assumed: one stated scale in twenty is wrong (benchmarks/scale.py --checked)
@@ -167,16 +168,18 @@ class _Columns:
         self._groups = groups + [None] * rest
         self._given = [known.get(name, np.inf) for name in self.names] + [1.0] * rest
 
-    def evidence(self, scale: float | None = None, alone: bool = False) -> Evidence:
+    def evidence(self, scale: float | None = None, sized: str = '') -> Evidence:
         """Return the evidence; with another usual `scale` of the device that nobody checked.
 
-        Of that `alone`, while its strains are usual, or also of these.
+        And of its strains, all of one size; or usual ones, if either of both is `sized` alone.
         """
         far = self.scale if scale is None else scale
-        typical = TYPICAL | {'scale': far}
-        known = [self._checked if scale is None else 0.0] * self._device
-        if alone:
-            known[:-1] = [self._checked or self.scale] * len(STRAINS)
+        typical = TYPICAL | {'scale': self.scale if sized == 'strains' else far}
+        known = [self._checked if sized or scale is None else 0.0] * self._device
+        if sized == 'strains':
+            known[-1] = far
+        elif sized:
+            known = [each or self.scale for each in known[:-1]] + [0.0]
         groups = self._groups + [None if each else 'scale' for each in known]
         given = np.array(self._given + [each or np.inf for each in known])
         return Evidence(*self.normal, given**-2.0, groups, typical)
