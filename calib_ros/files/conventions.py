@@ -163,5 +163,6 @@ def _sizes(made: Columns, names: Sequence[str]) -> FloatArray:
     """Return standard deviations (N, len(names)); blank ones are not stated: 0."""
     found = np.nan_to_num(made.numbers(names))
     wrong = found.any(axis=1) & ~(found > 0.0).all(axis=1)
-    made.refuse(wrong, f'{", ".join(names)} must be positive, or all blank')
+    told = f'standard deviations {", ".join(names)}'
+    made.refuse(wrong, f'{told} must be positive, or all blank; name other columns otherwise')
     return found

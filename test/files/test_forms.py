@@ -212,7 +212,10 @@ def test_standard_deviations_beside_our_own_columns(guessed, path, names):
     for wrong in (-2e-3, np.nan):
         sizes[2, 1] = wrong
         text = text_of(JOINTS, PLACES, quat, sizes, names=['q1', 'q2', *POSE_COLUMNS, *names])
-        with pytest.raises(InputError, match='line 4: sx, sy, sz must be positive, or all blank'):
+        with pytest.raises(
+            InputError,
+            match='line 4: standard deviations sx, sy, sz must be positive, or all blank',
+        ):
             guessed(text)
 
 

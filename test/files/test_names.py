@@ -133,7 +133,7 @@ def test_deviations_tell_that_plain_coordinates_may_be_nominal(path):
     given = [*NAMES, *names('{}_nom'), 'dx', 'dy', 'dz']
     path.write_text(text_of(*measured, names=given))
     assert_same(read_table(path, 2), None)
-    for apart in ('s{}', '{}_std', '{}_vel', '{}min', 'residual{}'):  # others
+    for apart in ('{}_std', '{}_vel', '{}min', 'residual{}'):  # others
         path.write_text(text_of(*columns, names=[*NAMES, *(apart.format(a) for a in 'xyz')]))
         assert len(loading.table(path, ARM, Settings()).fitted[0]) == 3
 
