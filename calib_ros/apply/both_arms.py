@@ -77,7 +77,7 @@ def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str
     if not fitted:
         return chain
     chain = reframed(chain, fitted, fixed=False)
-    plain = [replace(s, oriented=np.zeros_like(s.oriented), covariance=None) for s in sets]
+    plain = [replace(s.without_orientations(), covariance=None) for s in sets]
     problem = Problem(chain, plain[0], more=plain[1:], loss='none')
     chain = in_new_frames(problem, chain, fitted, problem.system(plain), needed=False)
     for tool in (name for name in fitted if name in {each.tool for each in sets}):

@@ -51,7 +51,7 @@ def noise_seen(chain: Chain, sets: Sequence[Observations]) -> float:
     The chain is the calibrated one, in the frames of the measurements. Gross errors are left out.
     """
     worn = [name for group in WORN for name in effects.members(chain, group)]
-    plain = [replace(each, oriented=np.zeros_like(each.oriented)) for each in sets]
+    plain = [each.without_orientations() for each in sets]
     problem = Problem(chain, plain[0], more=plain[1:])
     frames = dict.fromkeys(frame for each in sets for frame in (each.base, each.tool))
     own = [name for frame in frames for name in parameters_of(frame)]

@@ -152,9 +152,11 @@ def _beyond_reach(problem: Problem, given: Trial) -> Diagnosis | None:
     for each in given.sets:
         beyond = '' if each.inverse or each.socket else problem.beyond_reach(each.positions)
         if beyond:
-            remedy = 'are they in mm (--length mm)? Something else is wrong as well'
-            asked = 'are they in mm? Something else is wrong as well'
-            suspect = Suspect(f'the positions {beyond}', remedy, published=asked)
+            what, asked = (
+                f'the positions {beyond}',
+                'are they in mm{}? Something else is wrong as well',
+            )
+            suspect = Suspect(what, asked.format(' (--length mm)'), published=asked.format(''))
             return Diagnosis((suspect,), given.error, np.nan)
     return None
 
@@ -314,7 +316,7 @@ def _wrong_rotations(
     whole = all(each.oriented.all() and not (each.socket or each.inverse) for each in sets)
     if _has_images(problem) or not whole:
         return None
-    alone = tuple(replace(each, oriented=np.zeros(len(each), dtype=bool)) for each in sets)
+    alone = tuple(each.without_orientations() for each in sets)
     placed = in_frames(problem, chain, alone)
     if placed.error <= min(problem.largest_error, NEARER * given.error):
         known = placed.error + LEVER * problem.sigma_orientation

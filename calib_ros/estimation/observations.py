@@ -195,6 +195,10 @@ class Observations(Shown):
         stride = -(-len(self) // most)
         return self if stride < 2 else self.select(np.arange(0, len(self), stride))
 
+    def without_orientations(self) -> Observations:
+        """Return the observations as of positions alone."""
+        return replace(self, oriented=np.zeros_like(self.oriented))
+
     def some_images(self) -> Observations:
         """Return evenly spread images with all their rows, at most SOME_POSES."""
         stride = -(-(int(self.images[-1]) + 1) // SOME_POSES)

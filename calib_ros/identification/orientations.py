@@ -8,9 +8,6 @@ Positions alone do not show how a target is turned on the flange.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-
-import numpy as np
 
 from calib_ros.estimation.observations import Observations
 from calib_ros.identification.calibration import Calibration
@@ -26,9 +23,7 @@ def with_known_turns(
     """
     unknown = _unknown(arm, sets, new)
     return tuple(
-        replace(each, oriented=np.zeros_like(each.oriented))
-        if unknown.intersection((each.base, each.tool))
-        else each
+        each.without_orientations() if unknown.intersection((each.base, each.tool)) else each
         for each in sets
     )
 
