@@ -42,7 +42,7 @@ def refuse_ignored(options: argparse.Namespace, source: str) -> None:
     """Refuse options that a bag, or a table, would ignore."""
     if source == 'table':
         of_bags = (n for title in SETTINGS if title.startswith('bags') for n in SETTINGS[title])
-        refuse(options, (*of_bags, 'frame_id', 'largest_loss'), 'does not apply to a table')
+        refuse(options, (*of_bags, 'largest_loss'), 'does not apply to a table')
     else:
         instead = 'does not apply to a bag: add eye_in_hand=true to its --sources'
         refuse(options, ('eye_in_hand',), instead)

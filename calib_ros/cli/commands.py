@@ -112,7 +112,7 @@ $ plan --chain ur10e --iso9283 --out tests.csv
 what is wanted
   --chain! ROBOT  {CHAIN}
   --poses N  number of poses; default: 25, or as --accuracy needs
-  --accuracy MM  wanted RMS position error at the task poses
+  --accuracy MM  wanted RMS position error at the task poses [mm]
   --iso9283  the five test poses of ISO 9283 instead
   --task FILE  CSV q1..qn of work poses; default: random poses
   --taken FILE  CSV q1..qn of poses already measured
@@ -127,10 +127,10 @@ poses to choose from
   --seed N=0  {SEED}
 what the device sees
   --measured pose|position=pose  what is measured at each pose
-  --box M*6  measurable region: lower, upper corner
-  --tracker M*3  position of the device
+  --box M*6  measurable region: lower, upper corner [m]
+  --tracker M*3  position of the device [m]
   --axis X*3=0,0,1  axis of the target that must face the device
-  --cone DEG=45  largest angle between axis and line of sight
+  --cone DEG=45  largest angle between axis and line of sight [deg]
   --world  box and tracker are in the world frame, not the base frame
 @settings sigma_position sigma_orientation priors model fixed
 {REPORT}
@@ -153,7 +153,7 @@ what to write
   --force  {FORCE}
   --history DIR  {HISTORY}
   --json  print the result as JSON
-  --tolerance MM  wanted RMS position error
+  --tolerance MM  wanted RMS position error [mm]
 what a camera saw (docs/images.md)
   --detections FILE  board corners from calib_ros images
   --board FILE  YAML of that board
@@ -167,7 +167,7 @@ image and x y z qx qy qz qw of the flange
 {PDF}
 an earlier calibration (docs/history.md)
   --previous CALIBRATION  update this calibration with a few poses, and report what changed
-  --growth MM={1e3 * GROWTH}  expected drift of lengths in a year; angles: twice as many mrad
+  --growth MM={1e3 * GROWTH}  expected drift of lengths in a year [mm]; angles: twice as many mrad
 {MOVED}
 ## Use the calibration
 # export calibration._export  write a calibration for controllers, drivers and URDF users
@@ -213,7 +213,7 @@ intends
 {LOSS}
 {MOVED}
 how to judge
-  --tolerance MM  wanted RMS position error; without it: does the calibration still hold?
+  --tolerance MM  wanted RMS position error [mm]; without it: does the calibration still hold?
   --confidence SHARE=0.95  confidence of the interval of the RMS error
   --json  print the verdict and its figures as JSON
   --out FOLDER  folder for the report and the residuals
@@ -232,13 +232,13 @@ what to map
   --out! FOLDER  folder for tables, text and figures
   --force  {FORCE}
   --poses N=20000  random poses to survey
-  --model {'|'.join(MODELS)}=corrected  chain that commands the arm
+  --model {'|'.join(MODELS)}=corrected  chain that commands the arm; not the --model of identify
   --seed N=0  {SEED}
 a task to place
   --task FILE  CSV x y z qx qy qz qw in the task frame
   --joint-box Q+  joint range of a task [rad, m]: lower, then upper values
   --aim {'|'.join(AIMS)}=mean  error over the task poses to minimise
-  --region M*6  where the task may be placed: lower, upper corner
+  --region M*6  where the task may be placed: lower, upper corner [m]
   --cells N=9  placements along each axis
   --turns N=1  turns about the vertical to try
 {REPORT}

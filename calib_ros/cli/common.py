@@ -20,14 +20,10 @@ Contents: TypeAlias = dict[str, str | bytes]  # content of files by name
 SETTINGS = {
     'the fit': ('model', 'fixed', 'priors', 'loss', 'folds', 'socket_distance'),
     'how the device measures': (
-        'sigma_position',
-        'sigma_orientation',
-        'sigma_pixel',
-        'sigma_scale',
-        'frame_id',
+        *('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_scale'),
     ),
     'what is not accepted': ('largest_length', 'largest_angle', 'largest_error'),
-    'bags: what is read': ('joint_topics', 'sources', 'joint_names', 'delay'),
+    'bags: what is read': ('joint_topics', 'sources', 'frame_id', 'joint_names', 'delay'),
     'bags: how poses are taken': (
         *('mode', 'still', 'settle', 'shortest_stop', 'longest_stop', 'max_gap', 'lateness'),
         *('joint_buffer', 'pose_buffer', 'wanted_accuracy'),

@@ -62,7 +62,9 @@ class _Parser(argparse.ArgumentParser):
         wrong = [w for w in rest if not any(k.startswith(w.partition('=')[0]) for k in known)]
         if wrong and 'required: ' in message:
             message = unknown_word(wrong[0], self)
-        for kind, what in (('int', 'a whole number'), ('float', 'a number in the unit of --help')):
+        action = self._option_string_actions.get(message.split(':')[0].removeprefix('argument '))
+        unit = ''.join(re.findall(r' \[.+?\]', str(action and action.help))[:1])
+        for kind, what in (('int', 'a whole number'), ('float', f'a plain number{unit}')):
             message = message.replace(f'invalid {kind} value:', f'must be {what}, not')
         if message.endswith(': --chain'):
             message += ' (calib_ros robots lists the arms supplied)'

@@ -135,7 +135,7 @@ def test_the_help_of_a_command(shown, name):
         (('identify', 'a.csv', 'b.csv', *UR5E), 'join several files in one table, with'),
         (('chain',), 'required: ROBOT'),
         (('identify', 'measured.csv'), '--chain (calib_ros robots lists the arms supplied)'),
-        (('verify', 'a.csv', '--tolerance', '0,2'), "in the unit of --help, not '0,2'"),
+        (('verify', 'a.csv', '--tolerance', '0,2'), "must be a plain number [mm], not '0,2'"),
         (('identify', 'measured.csv', *UR5E, '--folds', 'five'), "a whole number, not 'five'"),
         (('simulate', 'bag', *UR5E, '--storage', 'rosbag1'), "invalid choice: 'rosbag1'"),
     ],
