@@ -48,10 +48,10 @@ class Screen:
         """Print a verdict; the colour never says more than the words."""
         self.reasons = [text]
         console = None if self.quiet else console_of(sys.stdout)
-        if console is None:
-            self.say(text)
-        else:
+        if console is not None:
             console.print(rich_text(text, STYLES[good]))
+        elif not self.quiet:
+            print(wrapped(text, '', '  ', width_of(sys.stdout)))
 
     def table(self, rows: Mapping[str, str]) -> None:
         """Print a table of names and values, without empty ones."""

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from calib_ros.cli.screen import Screen
+
 
 @pytest.mark.parametrize('given', ['--version', 'robots'])
 def test_who_reads_no_further_is_no_error(given):
@@ -37,3 +39,12 @@ def printed_in(shell, command):
     given = [shell, '-c', command]
     ended = subprocess.run(given, env=environment, capture_output=True, text=True, check=False)
     return ended.returncode, ended.stderr
+
+
+def test_a_verdict_in_a_file_is_wrapped_as_what_follows_it(capsys):
+    Screen().title('Nothing to correct at these poses' + 6 * ', by far')
+    Screen(quiet=True).title('Accepted')
+    shown = capsys.readouterr().out.splitlines()
+    assert len(shown) == 2
+    assert len(shown[0]) <= 80
+    assert shown[1].startswith('  ')
