@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from calib_ros.decision.matrices import damage_error, parse_rows, unpacked_matrix
-from calib_ros.errors import ConfigError
+from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import SOME_POSES
@@ -149,6 +149,9 @@ class Record:
     def check(self, chain: Chain, nominal: Chain, settings: Settings | None = None) -> None:
         """Refuse a calibration of another nominal chain (`parse_calibration`)."""
         self._check_table(chain)
+        frames = 'base', 'tool', *dict(chain.frames)
+        for name in {*outdated(self.content)}.difference(frames):
+            raise UnknownNameError(f'{self.where}: frame', name, frames)
         comparable = self._part('nominal').get('convention') == nominal.convention
         if comparable:
             self._check_nominal(nominal)

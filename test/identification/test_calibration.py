@@ -309,6 +309,7 @@ GOOD = {'nominal': nominal_document(UR), 'rms_mm_after': 0.1, 'world_frame': 'tr
         ('ur10', {'nominal': nominal_document(load_chain('ur10e'))}, r'\.d 0.1807 and not 0.1273'),
         ('ur10e', {'nominal': {'convention': 'standard'}}, 'must be a list of 5 numbers'),
         ('ur10e', {'nominal': 'ur10e'}, 'must be a mapping'),
+        ('ur10e', GOOD | {'outdated': ['bases']}, 'unknown frame "bases": did you'),
         *(
             ('ur10e', GOOD | {key: value}, rf'c\.yaml: calibration\.{key} must be')
             for key, values in {
