@@ -290,8 +290,9 @@ def _cut(text: str, longest: int) -> str:
     """
     glued = re.sub(r'(?<=\d) | (?=\d)', '\0', text)
     kept = textwrap.shorten(glued, longest, placeholder='').replace('\0', ' ')
-    whole = kept.rpartition(' (')[0] if kept.count('(') > kept.count(')') else kept
-    return whole.rstrip(',;:')
+    while kept.count('(') > kept.count(')'):
+        kept = kept.rpartition(' (')[0]
+    return kept.rstrip(',;:')
 
 
 def _moved(result: Identification, given: Snapshot) -> str:

@@ -280,8 +280,8 @@ class CalibrationSession:
 
     @property
     def summary(self) -> str:
-        """Return the account of the messages and the warnings as text."""
-        return '; '.join((str(self.account()), *(hint.text for hint in self.last_hints)))
+        """Return the warnings, then the account of the messages as text."""
+        return '; '.join((*(hint.text for hint in self.last_hints), str(self.account())))
 
     @property
     def estimate(self) -> Estimate | None:

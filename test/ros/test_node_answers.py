@@ -37,7 +37,7 @@ JOINT_RATE = 25.0  # they cost more than what is asked
 
 def test_errors_are_answers(cell, recording):
     for name, said in (
-        ('identify', 'check joint_topics, sources, their types and QoS$'),
+        ('identify', 'nothing was received: check joint_topics, sources, their types and QoS; 0'),
         ('capture', 'no joint states of this arm received'),
         ('remove_last', 'no pose to remove'),
         ('validate', 'identify or load one first'),
@@ -86,7 +86,7 @@ def test_an_accepted_answer_keeps_its_hint_whole_and_says_how_to_save(cell, tmp_
     identifying._journal = tmp_path / 'ur10e_20260102T030405000006Z.csv'
     verdict, hint = 'accepted: 40 poses, RMS 1.911 -> 0.0053 mm', 'J moves one way: mix the order'
     said, end = f'{verdict} (95 %: 0.0045 to 0.006 mm); {"valid " * 30}', KEEP + NOT_FILED
-    for advice, kept in ((hint, f' {hint}'), (f'{hint} ({30 * "then "})', f' {hint}'), ('', '')):
+    for advice, kept in ((hint, f' {hint}'), (f'{hint} (a ({40 * "on "}))', f' {hint}'), ('', '')):
         identifying._short = said, advice, end
         _, found = identifying.shortened((True, 20 * said))
         assert len(found) <= 200
