@@ -276,7 +276,7 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
         if each.steps:
             screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
     if not all(each.steps for each in reasons):
-        screen.bullet('Other findings probably follow from it: the report (--out) lists them')
+        screen.bullet('Other findings probably follow from it: the report of --out lists them')
         return
     explained = (BRINGS.keys() - UNSURE) & {each.rule for each in result.refusals}
     if not explained and 1.0 < result.noise.position < FAR and not result.noise.consistent:

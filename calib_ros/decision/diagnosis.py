@@ -51,7 +51,7 @@ class Diagnosis:
             f' (the uncorrected arm is then typically {rounded(1e3 * self.corrected)} mm off, not '
             f'{rounded(1e3 * self.given)} mm)'
         )
-        return Reason(Rule.MISTAKE, f'{self.where}{" -- or ".join(whats)}', errors)
+        return Reason(Rule.MISTAKE, f'{self.where}{"; or ".join(whats)}', errors)
 
     def __str__(self) -> str:
         return str(self.reason)

@@ -152,11 +152,9 @@ def _beyond_reach(problem: Problem, given: Trial) -> Diagnosis | None:
     for each in given.sets:
         beyond = '' if each.inverse or each.socket else problem.beyond_reach(each.positions)
         if beyond:
-            what, asked = (
-                f'the positions {beyond}',
-                'are they in mm{}? Something else is wrong as well',
-            )
-            suspect = Suspect(what, asked.format(' (--length mm)'), published=asked.format(''))
+            asked = 'are they in mm{}, with something else wrong as well, or of several devices{}?'
+            remedy = asked.format(' (--length mm)', ' (column device)')
+            suspect = Suspect(f'the positions {beyond}', remedy, published=asked.format('', ''))
             return Diagnosis((suspect,), given.error, np.nan)
     return None
 

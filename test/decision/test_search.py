@@ -211,7 +211,7 @@ def test_what_is_wrong_with_some_rows_is_not_the_arm(searched, monkeypatch):
 
 def test_errors_with_and_without_a_mistake_are_told_in_millimetres():
     told = Diagnosis((Suspect('a', 'undo a'), Suspect('b', 'undo b')), 23.456789, 0.0012)
-    said = 'a: undo a -- or b: undo b'
+    said = 'a: undo a; or b: undo b'
     assert told.reason.short == said
     off = 'the uncorrected arm is then typically 1.200 mm off, not 23,457 mm'
     assert str(told) == f'{said} ({off})'
