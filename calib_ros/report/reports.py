@@ -173,8 +173,8 @@ def _within(judged: Comparison, wanted_mm: float | None, when: int = 1) -> tuple
 
 def may_be_closer(result: Identification, beyond: bool = False) -> bool:
     """Tell whether effects not tried may explain an error `beyond` what is wanted or the noise."""
-    beyond = beyond or (result.noise.position > ALIKE and not result.noise.consistent)
-    return beyond and not (result.chain.effects or result.verdicts)
+    more = not result.noise.consistent and (beyond or result.noise.position > ALIKE)
+    return more and not (result.chain.effects or result.verdicts)
 
 
 def _steps(
@@ -191,7 +191,9 @@ def _steps(
         'again.': used and bool(result.remarks),
         sentence(CLOSER): used and may_be_closer(result, verdict == 'FAIL'),
         'Compare the remaining error with the accuracy of the measuring device: no calibration '
-        'gets below that.': verdict == 'FAIL',
+        'gets below that.': verdict == 'FAIL' and not result.noise.consistent,
+        'What is left looks like the noise of the device: measure more poses, or with a more '
+        'accurate device.': verdict == 'FAIL' and result.noise.consistent,
         f'Measure more poses to decide on the tolerance, {SPREAD_OUT}.': verdict == 'UNDECIDED',
         sentence(bring(result)): used,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '

@@ -217,6 +217,8 @@ def test_effects_are_proposed_where_more_than_noise_is_left_and_none_was_tried(
     left = replace(result, noise=noise)
     assert (sentence(CLOSER) in report_of(problem, left).steps) == proposed
     assert not may_be_closer(replace(left, verdicts=(None,)), beyond=True)
+    steps = report_of(problem, left, tolerance=1e-6).steps
+    assert (sentence(CLOSER) in steps) != any('measure more poses' in step for step in steps)
 
 
 def test_far_more_than_noise_is_left_asks_what_was_loose_even_if_accepted(solved):
