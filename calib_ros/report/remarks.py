@@ -31,7 +31,7 @@ def each_in_words(found: Verification) -> list[str]:
     what = 'repeatability' if found.by_program else 'scatter'
     lines = ['  pose   measured   before    after' + repeated * f'   {what} (mean + 3 std)']
     for k, pose in enumerate(found.each, 1):
-        line = f'  {k:4} {pose.cycles:10} {rounded(pose.before):>8} {rounded(pose.after):>8}'
+        line = f'{f"P{k}":>6} {pose.cycles:10} {rounded(pose.before):>8} {rounded(pose.after):>8}'
         again = '' if pose.repeatability is None else f' {rounded(pose.repeatability):>8}'
         lines.append(line + again)
     return lines if found.each else []

@@ -79,7 +79,7 @@ def _by_configuration(found: Verification) -> Section:
     title, names = 'Pose by pose (ISO 9283) [mm]', ('AP before', 'AP after', 'RP')
     text = (
         'AP: position accuracy of the mean over all cycles. RP: repeatability, mean + 3 std. '
-        'The standard asks for 30 cycles.'
+        'The standard asks for 30 cycles. Poses are numbered in the order of measurement.'
     )
     if not found.by_program:
         title, names = 'Pose by pose', ('before [mm]', 'after [mm]', 'scatter [mm]')
