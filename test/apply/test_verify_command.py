@@ -62,7 +62,7 @@ def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, run):
         assert 'poses like these   RMS 0.' in out
         assert 'judges the calibration' not in out
         assert '15 times at 5 poses' in out
-        assert len([line for line in out.splitlines() if line[:6].strip().isdigit()]) == 5
+        assert sum(line.startswith('    P') for line in out.splitlines()) == 5
     status, _, err = run(*judge, '--tolerance', 300)
     assert status == 1
     assert '--tolerance must be between 0 and 100 mm, not 300 mm' in err
