@@ -16,9 +16,12 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
+from calib_ros.atomic import given_path
+from calib_ros.kinematics.chain_file import chain_text
+
 KINEMATICS = Path(__file__).with_name('moveit_kinematics.yaml')
 ARGUMENTS = {
-    'urdf': ('', 'corrected URDF, from `calib_ros export --urdf` or ~/export'),
+    'urdf': (None, 'corrected URDF, from `calib_ros export --urdf` or ~/export'),
     'moveit_robot': ('', 'name of the robot in its MoveIt configuration'),
     'moveit_package': ('', 'MoveIt configuration of the robot; empty: without MoveIt'),
     'kinematics': (str(KINEMATICS), 'parameter file with numeric solvers'),
@@ -28,7 +31,7 @@ ARGUMENTS = {
 def start(context: LaunchContext) -> list[Node]:
     """Return the nodes; the corrected description comes last, so that it holds."""
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
-    text = Path(given['urdf']).expanduser().read_text(encoding='utf-8')
+    text = chain_text(given_path(given['urdf']))
     described = {'robot_description': ParameterValue(text, value_type=str)}
     nodes = [
         Node(

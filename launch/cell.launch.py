@@ -29,6 +29,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 from calib_ros.atomic import given_path
 from calib_ros.errors import ConfigError
+from calib_ros.kinematics.chain_file import chain_text
 from calib_ros.ros.arguments import (
     NODE,
     launch_arguments,
@@ -81,7 +82,7 @@ def start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     measured_pose = given['measured_pose'] or 'measured_pose'
     started: list[LaunchDescriptionEntity] = []
     if given['urdf']:
-        text = given_path(given['urdf']).read_text(encoding='utf-8')
+        text = chain_text(given_path(given['urdf']))
         if not given['chain'] and not given['params_file']:
             given['chain'] = 'robot_description'
         started.append(

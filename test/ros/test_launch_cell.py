@@ -108,6 +108,14 @@ def test_a_delay_that_is_none_is_refused_at_the_start(launched):
         launched('cell.launch.py', chain='ur10e', respawn_delay='2 s', **QUIET)
 
 
+@pytest.mark.parametrize('name', ['cell.launch.py', 'examples/corrected_arm.launch.py'])
+def test_a_urdf_that_is_not_there_is_named_with_a_similar_one(launched, tmp_path, name):
+    (tmp_path / 'robot.urdf').write_text('<robot name="arm"/>')
+    path = tmp_path / 'robto.urdf'
+    with pytest.raises(ConfigError, match=f'URDF {path}: .*: did you mean "robot.urdf"'):
+        launched(name, urdf=str(path))
+
+
 def test_the_example_feeds_the_corrected_urdf_to_all(launched, tmp_path, monkeypatch):
     urdf = tmp_path / 'robot_corrected.urdf'
     urdf.write_text('<robot name="corrected"/>')
