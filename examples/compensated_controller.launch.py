@@ -11,7 +11,7 @@ Nothing moves so far. When the corrected trajectories are what you expect, start
 `execute:=true`: they go to the controller, and the arm moves as soon as one is sent.
 
 What has no calibration, a point that cannot be corrected, or a correction that is too large is
-not passed on, and nothing else is in its place: the arm stays where it is, and ~/status and the
+not passed on, and nothing else is in its place: the arm stays where it is, and the log and the
 diagnostics say why. The first point is corrected, too: give it a time_from_start in which the arm
 can get there, for the controller interpolates from where the arm is. No other publisher
 may send to the controller meanwhile; the action interface (MoveIt uses it) goes past the node.
