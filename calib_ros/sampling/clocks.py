@@ -143,8 +143,10 @@ class Clocks:
     def _moves_much(self, rows: Rows) -> bool:
         """Tell whether a target moves by more than errors are."""
         places = rows.values[rows.stamps > self._looked_ns, POSITION_SLICE]
+        if not len(places):
+            return False
         far = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-        return len(far) > 0 and bool(np.median(far) > self.settings.largest_error)
+        return bool(np.median(far) > self.settings.largest_error)
 
     def find(self, collector: Collector, now_ns: int | None) -> None:
         """Estimate the delay for a collector, at intervals until it is clear.

@@ -142,6 +142,19 @@ def test_a_target_that_was_carried_to_the_arm_stays_in_the_account_alone():
     assert (stood.status, stood.explains) == ('', False)
 
 
+@pytest.mark.filterwarnings('error')
+def test_a_device_that_falls_silent_while_the_arm_stands_moves_no_target():
+    """The median of none was a warning of numpy on the console."""
+    at = np.zeros(6)
+    joint_times, times = np.arange(0.0, 40.0, 0.01), np.arange(0.05, 10.0, 0.05)
+    seen = measure(UR10E, np.tile(at, (len(times), 1)), np.random.default_rng(0), *NOISE)
+    session = CalibrationSession(UR10E)
+    for known, count in ((joint_times < 20.0, len(times)), (joint_times >= 20.0, 0)):
+        given = (each[:count] for each in (times, seen.positions, seen.rotations))
+        told(session, joint_times[known], np.tile(at, (sum(known), 1)), *given)
+    assert 'frozen' not in session.status()
+
+
 @pytest.mark.parametrize(('seed', 'jump'), [(1, 0.0), (1, 0.08), (3, 0.0), (3, 0.08)])
 def test_a_shift_of_the_clocks_is_told_by_positions_alone(seed, jump):
     """Although the target is not the flange, and moves at another speed."""
