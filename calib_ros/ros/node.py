@@ -320,7 +320,7 @@ class CalibrationNode(Batched):
         count = len(self.session.samples)
         old = self._archive.start_new()
         self.session.clear()
-        told, kept = f'{counted(count, "pose")} cleared', f'; they remain in {old}'
+        told, kept = f'{counted(count, "pose")} cleared', f'; kept in {old}'
         told += kept * bool(old and count)
         return True, told + '; the calibration stays' * (self.session.calibration is not None)
 

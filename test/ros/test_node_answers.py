@@ -215,7 +215,7 @@ def test_record_remove_last_and_clear(cell, recording):
     assert cell.done('remove_last').message == 'pose 5 removed'
     assert len(cell.node.session.samples) == 4
     cleared = cell.done('clear')
-    assert '4 poses cleared; they remain in' in cleared.message
+    assert '4 poses cleared; kept in' in cleared.message
     assert 'calibration' not in cleared.message  # there is none
     account = cell.node.session.account()
     assert account.samples == account.joint_states == 0

@@ -356,7 +356,7 @@ def test_a_calibration_is_saved_where_it_was_to_be_when_it_was_called(
             'set_parameters': '',
             'clear': '23 poses',
         },
-        {'clear': ' poses cleared; they remain', 'identify': 'no poses to fit'},
+        {'clear': ' poses cleared; kept in', 'identify': 'no poses to fit'},
         {'set_parameters': '', 'identify': 'NOT accepted'},
     ],
 )
