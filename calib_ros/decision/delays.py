@@ -64,7 +64,7 @@ def timed(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
                 told.append(
                     f'measurements of {base} are early or late by {two_digits(1e3 * jitter)} ms '
                     'at random: stamps jitter, or the device or the joint states are smoothed. '
-                    f'Figures leave out what this explains. {remedy}'
+                    f'Figures are for the arm at rest. {remedy}'
                 )
     except (CalibrationError, np.linalg.LinAlgError):  # told by the whole fit
         pass

@@ -105,6 +105,48 @@ def held_out_excess(
     return found / likely, float(np.sqrt(found**2 - noise**2)) / expected
 
 
+def as_at_rest(found: Comparison, fitted: Fitted, posterior: Posterior) -> Comparison:
+    """Return residuals as large as those of still poses.
+
+    Without what jitter of stamps explains, errors of arm and device along the motion are hidden,
+    too: to the squares, before and after, is added what is expected of those after.
+    """
+    sets = fitted.problem.sets if found.repeated is None else fitted.problem.judging
+    if all(each.punctual is None for each in sets):
+        return found
+    both = [np.stack([e.position, e.orientation]) for e in (found.before, found.after)]
+    for rows, each in zip(by_set(np.arange(len(found.judged)), sets), sets, strict=True):
+        parts = [part[:, rows[found.deciding[rows]]] for part in both]
+        before, after = ((part**2).sum(axis=2).mean(axis=1) for part in parts)
+        hidden = _hidden(each, after, fitted, posterior)
+        for part, squares in zip(both, (before, after), strict=True):
+            part[:, rows] *= np.sqrt(1.0 + hidden / squares)[:, np.newaxis, np.newaxis]
+    pairs = zip((found.before, found.after), both, strict=True)
+    first, last = (replace(e, position=p[0], orientation=p[1]) for e, p in pairs)
+    return replace(found, before=first, after=last)
+
+
+def _hidden(
+    each: Observations, seen: FloatArray, fitted: Fitted, posterior: Posterior
+) -> FloatArray:
+    """Return the mean squares (2,) of lengths and turns that are hidden beside those `seen`."""
+    few, problem = each.spread(), fitted.problem
+    if few.punctual is None:
+        return np.zeros(2)
+    given = few.covariances((problem.sigma_position, problem.sigma_orientation))
+    still, size = few.punctual @ given, fitted.noise.position
+    arm = posterior.expected(few.joints, few.base, few.tool, few.approach)
+    parts = (
+        arm + size**2 * still,
+        _judged(few, arm + size**2 * given),
+        arm + min(size, 1.0) ** 2 * still,
+    )
+    rest, judged, least = (
+        np.einsum('nii->i', squares).reshape(2, 3).sum(axis=1) / len(few) for squares in parts
+    )
+    return np.asarray(np.maximum(np.fmax(seen * rest / judged, least) - seen, 0.0))
+
+
 def _judged(each: Observations, squares: FloatArray) -> FloatArray:
     """Return the squares (N, 6, 6) of errors as they are judged."""
     kept = each.punctual

@@ -18,7 +18,7 @@ import numpy as np
 from calib_ros.annotated import as_annotated
 from calib_ros.decision import mistakes, plausibility
 from calib_ros.decision.acceptance import oddities, refusals
-from calib_ros.decision.comparison import compare
+from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.decision.delays import timed
 from calib_ros.decision.drift import chance_of_gain
 from calib_ros.decision.misfits import arms_own, coupling_share, frozen_joints, outliers_of
@@ -34,7 +34,7 @@ from calib_ros.decision.rounding import (
 )
 from calib_ros.decision.steps import find_step
 from calib_ros.decision.strain import strain_of
-from calib_ros.decision.validation import held_out_excess, validate
+from calib_ros.decision.validation import as_at_rest, held_out_excess, validate
 from calib_ros.decision.wires import wrong_distances
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import count_distinct
@@ -103,9 +103,9 @@ def _identified(
     # of the least noise couplings are a part: they are no strain
     noise, least = _size(fitted, by_couplings), _size(fitted, by_strain)
     inference = Inference(fitted, noise, more, rounding, bool(strain), least)
-    posterior, uncertainty = _inferred(inference)
-    surprise, wider = held_out_excess(fitted, posterior, validation)
-    uncertainty = replace(uncertainty, parts=wider**2 * uncertainty.parts)
+    posterior, uncertainty, surprise, wider = _inferred(inference, validation)
+    at_rest = partial(as_at_rest, fitted=fitted, posterior=posterior.widened(wider))
+    judged = compare(before.chain, chain, problem.sets, ~robust.outliers, uncertainty.together)
     parameters = parameter_rows(fitted, uncertainty)
     region, scaled = _region(inference, posterior, wider)
     stuck, thawed = frozen_joints(fitted)
@@ -116,8 +116,8 @@ def _identified(
         parameters=parameters,
         names=names,
         uncertainty=uncertainty,
-        fitted=compare(before.chain, chain, problem.sets, ~robust.outliers, uncertainty.together),
-        validation=validation and replace(validation, together=uncertainty.together),
+        fitted=at_rest(judged),
+        validation=validation and at_rest(replace(validation, together=uncertainty.together)),
         validated_by=validated_by,
         noise=fitted.noise,
         distances=robust.distances,
@@ -158,12 +158,19 @@ def _in_best_frames(fitted: Fitted) -> Fit:
     return minimise(start, frames, system, tolerance=1e-5)
 
 
-def _inferred(inference: Inference) -> tuple[Posterior, Uncertainty]:
-    """Return the posterior with what no parameter explains, and the uncertainty of the fit."""
+def _inferred(
+    inference: Inference, validation: Comparison | None
+) -> tuple[Posterior, Uncertainty, float, float]:
+    """Return the posterior with what no parameter explains, and the uncertainty of the fit.
+
+    Then follow by how much held-out poses surprise, and the factor that uncertainty has for it.
+    """
     fitted, posterior = inference.fitted, inference.judging()
     unmodelled, moved = unmodelled_errors(posterior, fitted.factor, fitted.system)
     posterior = inference.with_mixture(replace(posterior, unmodelled=unmodelled))
-    return posterior, fitted.uncertainty.with_part(moved).with_part(unmodelled.square)
+    uncertainty = fitted.uncertainty.with_part(moved).with_part(unmodelled.square)
+    surprise, wider = held_out_excess(fitted, posterior, validation)
+    return posterior, replace(uncertainty, parts=wider**2 * uncertainty.parts), surprise, wider
 
 
 def _region(
