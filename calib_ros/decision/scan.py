@@ -194,10 +194,13 @@ class Scan:
 
     @cached_property
     def torn(self) -> Sequence[int]:
-        """Return the ends of all gross errors if they follow each other: a side is torn off."""
+        """Return the ends of all gross errors if they follow each other: a side is torn off.
+
+        Or a few poses beside a move.
+        """
         numbers, weights = np.concatenate(self.numbers), np.concatenate(self.weights)
         gross = np.setdiff1d(numbers, numbers[weights > 0.0])
-        alone = len(gross) >= LEAST_ASIDE and np.ptp(gross) < len(gross)
+        alone = len(gross) > 0 and np.ptp(gross) < len(gross)
         return (int(gross[0]), int(gross[-1]) + 1) if alone else ()
 
     def tears(self, group: Moving, size: FloatArray) -> bool:

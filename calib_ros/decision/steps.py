@@ -76,7 +76,8 @@ def find_step(fitted: Fitted) -> Step | None:
         return _described(scan, found, quiet)
     found = _imitated(scan, fitted)
     if found is not None and fitted.robust.outliers.any():
-        torn = found.group.kind in IN_THE_CELL and scan.tears(found.group, found.sizes[0])
+        torn = found.group.kind in IN_THE_CELL and found.stops[0] in scan.torn
+        torn = torn and scan.tears(found.group, found.sizes[0])
         scan = scan if torn else Scan(fitted, loaded=bends, gross=0)  # others are no move
         found = found if torn else _imitated(scan, fitted)
     step = None if found is None else _described(scan, found, quiet)
