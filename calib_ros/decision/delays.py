@@ -93,16 +93,24 @@ def _changed(
 def _without_drift(given: Problem, bases: Sequence[str]) -> tuple[Problem, list[float]]:
     """Return a problem with joints where they were seen, and how much the delays change [s].
 
-    By polynomials in time of the delays, fitted together beside all parameters: a device whose
-    delay still changes would bend the arm for the others.
+    By functions of time of the delays, fitted together beside all parameters: a device whose delay
+    still changes would bend the arm for the others. Clocks mostly drift evenly or jump once, and
+    the fewer functions there are, the less they imitate errors of the arm along its path:
+    polynomials are used only where they leave less than half of what a line or a step leaves.
     """
     stamps = {b: np.concatenate([e.stamps_ns for e in given.sets if e.base == b]) for b in bases}
-    problem, sizes = given, np.zeros(TELLING * len(bases))
+    steps = np.linspace(-1.0, 1.0, TELLING**2 + 1)[1:-1]
+    one = TELLING + len(steps)
+    every = one * np.arange(len(bases))[:, np.newaxis]
+    even = (every + range(TELLING)).ravel()
+    simple = [every.ravel(), *(every + range(TELLING, one)).reshape(-1, 1)]
+    problem, sizes = given, np.zeros(one * len(bases))
 
-    def waves(each: Observations) -> FloatArray:  # (N, TELLING D)
+    def waves(each: Observations) -> FloatArray:  # (N, one D)
         own = stamps.get(each.base, each.stamps_ns)
         times = 2.0 * (each.stamps_ns - own.min()) / max(np.ptp(own), 1) - 1.0
         found = np.polynomial.legendre.legvander(np.clip(times, -1.0, 1.0), TELLING)[:, 1:]
+        found = np.concatenate([found, np.sign(times[:, np.newaxis] - steps)], axis=1)
         return np.asarray(np.kron([float(each.base == base) for base in bases], found))
 
     def moved(each: Observations) -> Observations:
@@ -116,15 +124,28 @@ def _without_drift(given: Problem, bases: Sequence[str]) -> tuple[Problem, list[
             added = rows[k][count] * waves(each).T[:, np.newaxis]
             rows[k] = np.concatenate([rows[k][:count], added, rows[k][-1:]])
         matrix, poses = stacked(rows), sum(each.shape[-1] for each in rows)
-        share = gain_share(matrix, count)  # late poses have all their errors together
-        free = poses - len(sizes)
-        chance = chance_of(share / max(1.0 - share, ROUNDING) * free, len(sizes), free)
-        if not (share > EXCEPTION and chance < 1.0 - SURE and _lacking(fitted)):
+        groups = even, *simple
+        shares = [gain_share(_beside(matrix, count, group), count) for group in groups]
+        best = 1 + int(np.argmax(shares[1:]))
+        best = best if 1.0 - shares[0] > EXPLAINED * (1.0 - shares[best]) else 0
+        share, near = shares[best], _beside(matrix, count, groups[best])
+        by = np.linalg.lstsq(near[:, :-1], near[:, -1])[0]
+        left = np.sqrt(np.mean((near[:, -1] - near[:, :-1] @ by) ** 2))
+        many, free = len(groups[best]), poses - len(groups[best])
+        # late poses have all their errors together
+        chance = chance_of(share / max(1.0 - share, ROUNDING) * free, many, free) * len(groups)
+        enough = EXCEPTION if left < ALIKE else NEARER
+        if not (share > enough and chance < 1.0 - SURE and _lacking(fitted)):
             break
-        sizes += np.linalg.lstsq(matrix[:, :-1], matrix[:, -1])[0][count:]
+        sizes[groups[best]] += by[count:]
         problem = _changed(given, bases, moved)
     moves = [[waves(e) @ sizes for e in given.sets if e.base == base] for base in bases]
     return problem, [float(np.ptp(np.concatenate(each))) for each in moves]
+
+
+def _beside(matrix: FloatArray, count: int, group: FloatArray) -> FloatArray:
+    """Return the first columns, those of a group of the added ones, and the residual."""
+    return matrix[:, [*range(count), *(count + group), -1]]
 
 
 def _without_jitter(problem: Problem, base: str) -> tuple[Problem, float]:
