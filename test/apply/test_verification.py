@@ -107,7 +107,7 @@ def test_pass_fail_and_undecided(cell, arm, program):
     table = heads[heads.index(['pose', 'measured', 'before', 'after', 'scatter', *_UNIT]) :]
     for k, (pose, row) in enumerate(zip(near.each, table[1:6], strict=True), 1):
         figures = (pose.before, pose.after, pose.repeatability)
-        assert row == [str(k), '3', *map(rounded, figures)]
+        assert row == [f'P{k}', '3', *map(rounded, figures)]
 
 
 def test_poses_in_a_small_part_of_the_range_hold_only_there(cell, arm):
