@@ -61,8 +61,8 @@ OLDEST_TESTS ?= test/apply test/cli test/files test/kinematics \
 	$(foreach module,apply/chart apply/iso_9283 apply/placement apply/planning \
 	apply/stated_noise apply/verification cli/output files/atomic files/killed_results \
 	files/names,--ignore=test/$(dir $(module))test_$(notdir $(module)).py) \
-	test/identification/test_identification.py test/ros/test_node.py \
-	test/report/test_report_files.py
+	test/decision/test_delays.py test/identification/test_identification.py \
+	test/report/test_report_files.py test/ros/test_node.py
 
 oldest: $(OLDEST)/installed
 	$(OLDEST)/bin/python -m pytest -n auto --dist worksteal $(OLDEST_TESTS) $(PYTEST_ARGUMENTS)

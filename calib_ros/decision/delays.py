@@ -129,7 +129,7 @@ def _without_drift(given: Problem, bases: Sequence[str]) -> tuple[Problem, list[
         best = 1 + int(np.argmax(shares[1:]))
         best = best if 1.0 - shares[0] > EXPLAINED * (1.0 - shares[best]) else 0
         share, near = shares[best], _beside(matrix, count, groups[best])
-        by = np.linalg.lstsq(near[:, :-1], near[:, -1])[0]
+        by = np.linalg.lstsq(near[:, :-1], near[:, -1], rcond=None)[0]
         left = np.sqrt(np.mean((near[:, -1] - near[:, :-1] @ by) ** 2))
         many, free = len(groups[best]), poses - len(groups[best])
         # late poses have all their errors together
@@ -159,7 +159,7 @@ def _without_jitter(problem: Problem, base: str) -> tuple[Problem, float]:
     for _ in range(SEVERAL):
         fitted, rows = _rows(problem)
         matrix = stacked(rows)
-        late = np.append(-np.linalg.lstsq(matrix[:, :-1], matrix[:, -1])[0], 1.0)
+        late = np.append(-np.linalg.lstsq(matrix[:, :-1], matrix[:, -1], rcond=None)[0], 1.0)
         few = np.concatenate([rows[k][:, :3] for k in mine], axis=2)
         speed, errors = few[-2].T, np.tensordot(late, few, 1).T
         squares = np.maximum((speed**2).sum(axis=1), 1e-300)
@@ -317,5 +317,5 @@ def _explained(
     few = [replace(s, approach=None if s.velocity is None else rate(s.velocity)) for s in few]
     chain, names = result.chain.with_effects(lags), [*result.names, *lags]
     matrix = stacked(problem.system(few).rows_of(chain, names))
-    delays = np.asarray(np.linalg.lstsq(matrix[:, :-1], matrix[:, -1])[0][count:])
+    delays = np.asarray(np.linalg.lstsq(matrix[:, :-1], matrix[:, -1], rcond=None)[0][count:])
     return gain_share(matrix, count), delays, np.abs(delays) * norms(matrix[:, count:-1].T)

@@ -108,7 +108,7 @@ def _errors(fitted: Fitted, wires: Sequence[str], tried: Sequence[tuple[int, ...
 
 def _left(factor: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, float]:
     """Return the solution of some columns of a factor for its last one, and the squares left."""
-    found = np.linalg.lstsq(factor[:, [*columns]], factor[:, -1])[0]
+    found = np.linalg.lstsq(factor[:, [*columns]], factor[:, -1], rcond=None)[0]
     return np.asarray(found), float(np.sum((factor[:, -1] - factor[:, [*columns]] @ found) ** 2))
 
 

@@ -56,7 +56,9 @@ def test_all_that_a_bent_link_moves_is_one_change(arm, row):
         link = max((own for joint, own in columns.sets if joint == owner), key=len)
         known = np.concatenate([rows[..., :12], rows[..., 12:] @ columns.of(link)], 2)
         known = known.reshape(len(moved), -1)
-        np.testing.assert_allclose(known @ np.linalg.lstsq(known, moved)[0], moved, atol=1e-9)
+        np.testing.assert_allclose(
+            known @ np.linalg.lstsq(known, moved, rcond=None)[0], moved, atol=1e-9
+        )
 
 
 def test_another_height_of_the_target_shows_as_one_of_the_device():
