@@ -13,7 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
+from typing import TypeAlias
 
 import numpy as np
 from scipy import special
@@ -25,7 +26,7 @@ from calib_ros.decision.steps import EXPLAINED
 from calib_ros.errors import CalibrationError
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import SOME, fit
-from calib_ros.estimation.gain import gain_share
+from calib_ros.estimation.gain import gain_share, gain_shares
 from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
@@ -40,6 +41,8 @@ from calib_ros.kinematics.se3 import ROUNDING, FloatArray, norms
 from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.shown import two_digits
 
+Look: TypeAlias = Callable[[Problem], tuple[Fitted, list[FloatArray]]]
+
 
 def timed(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
     """Return the problem with measurements in motion as their stamps allow, and what they tell.
@@ -47,11 +50,11 @@ def timed(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
     Joints are moved to where a changing delay saw them. Of stamps that jitter, errors along the
     velocity count for less.
     """
-    told = list[str]()
+    told, rows_of = list[str](), cache(_rows)
     remedy = 'Stamp everything as it is measured, by one clock, or stop at each pose (mode dwell)'
     bases = sorted({each.base for each in problem.sets if _in_motion(each)})
     try:
-        problem, changes = _without_drift(problem, bases)
+        problem, changes = _without_drift(problem, bases, rows_of)
         for base, change in zip(bases, changes, strict=True):
             if change:
                 told.append(
@@ -59,7 +62,7 @@ def timed(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
                     f'clocks drift apart or jump. Joint values are corrected for it. {remedy}'
                 )
         for base in bases:
-            problem, jitter = _without_jitter(problem, base)
+            problem, jitter = _without_jitter(problem, base, rows_of)
             if jitter:
                 told.append(
                     f'measurements of {base} are early or late by {two_digits(1e3 * jitter)} ms '
@@ -90,7 +93,9 @@ def _changed(
     return problem.with_sets(fitted, held_out=judging)
 
 
-def _without_drift(given: Problem, bases: Sequence[str]) -> tuple[Problem, list[float]]:
+def _without_drift(
+    given: Problem, bases: Sequence[str], rows_of: Look
+) -> tuple[Problem, list[float]]:
     """Return a problem with joints where they were seen, and how much the delays change [s].
 
     By functions of time of the delays, fitted together beside all parameters: a device whose delay
@@ -118,24 +123,26 @@ def _without_drift(given: Problem, bases: Sequence[str]) -> tuple[Problem, list[
         return replace(each.earlier(read + waves(each) @ sizes), delay=each.delay)
 
     for _ in range(SEVERAL * bool(bases)):
-        fitted, rows = _rows(problem)
-        count = len(rows[0]) - 2
-        for k, each in enumerate(fitted.problem.sets):
-            added = rows[k][count] * waves(each).T[:, np.newaxis]
-            rows[k] = np.concatenate([rows[k][:count], added, rows[k][-1:]])
-        matrix, poses = stacked(rows), sum(each.shape[-1] for each in rows)
+        fitted, rows = rows_of(problem)
+        if not _lacking(fitted):
+            break
+        count, beside = len(rows[0]) - 2, list[FloatArray]()
+        for each, own in zip(fitted.problem.sets, rows, strict=True):
+            added = own[count] * waves(each).T[:, np.newaxis]
+            beside.append(np.concatenate([own[:count], added, own[-1:]]))
+        matrix, poses = stacked(beside), sum(each.shape[-1] for each in rows)
         groups = even, *simple
-        shares = [gain_share(_beside(matrix, count, group), count) for group in groups]
+        shares = gain_shares(matrix, count, groups)
         best = 1 + int(np.argmax(shares[1:]))
         best = best if 1.0 - shares[0] > EXPLAINED * (1.0 - shares[best]) else 0
-        share, near = shares[best], _beside(matrix, count, groups[best])
+        share, near = shares[best], matrix[:, [*range(count), *(count + groups[best]), -1]]
         by = np.linalg.lstsq(near[:, :-1], near[:, -1], rcond=None)[0]
         left = np.sqrt(np.mean((near[:, -1] - near[:, :-1] @ by) ** 2))
         many, free = len(groups[best]), poses - len(groups[best])
         # late poses have all their errors together
         chance = chance_of(share / max(1.0 - share, ROUNDING) * free, many, free) * len(groups)
         enough = EXCEPTION if left < ALIKE else NEARER
-        if not (share > enough and chance < 1.0 - SURE and _lacking(fitted)):
+        if not (share > enough and chance < 1.0 - SURE):
             break
         sizes[groups[best]] += by[count:]
         problem = _changed(given, bases, moved)
@@ -143,21 +150,18 @@ def _without_drift(given: Problem, bases: Sequence[str]) -> tuple[Problem, list[
     return problem, [float(np.ptp(np.concatenate(each))) for each in moves]
 
 
-def _beside(matrix: FloatArray, count: int, group: FloatArray) -> FloatArray:
-    """Return the first columns, those of a group of the added ones, and the residual."""
-    return matrix[:, [*range(count), *(count + group), -1]]
-
-
-def _without_jitter(problem: Problem, base: str) -> tuple[Problem, float]:
+def _without_jitter(problem: Problem, base: str, rows_of: Look) -> tuple[Problem, float]:
     """Return a problem with larger covariances along the velocity, and the jitter [s].
 
     Told by errors along it that are larger than those across. A fit to these is nearer to the arm,
     and tells more.
     """
     mine = [k for k, e in enumerate(problem.sets) if e.base == base and _in_motion(e)]
-    found = 0.0
+    found = across = 0.0
     for _ in range(SEVERAL):
-        fitted, rows = _rows(problem)
+        fitted, rows = rows_of(problem)
+        if not (found > 0.0 or _lacking(fitted)):
+            break
         matrix = stacked(rows)
         late = np.append(-np.linalg.lstsq(matrix[:, :-1], matrix[:, -1], rcond=None)[0], 1.0)
         few = np.concatenate([rows[k][:, :3] for k in mine], axis=2)
@@ -166,8 +170,7 @@ def _without_jitter(problem: Problem, base: str) -> tuple[Problem, float]:
         along = np.einsum('nc,nc->n', speed, errors) ** 2 / squares
         across = np.median(norms(errors) ** 2 - along) / special.chdtri(2, 0.5)
         jitter = np.median((along / special.chdtri(1, 0.5) - across) / squares)  # squared
-        told = found > 0.0 or _lacking(fitted)
-        if not told or jitter * np.median(squares) <= across:
+        if jitter * np.median(squares) <= across:
             break
         ratio = jitter / max(across, 1e-300)
         found += ratio

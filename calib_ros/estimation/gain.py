@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray, Index
 
 
 def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
@@ -36,13 +38,7 @@ def gain_of(products: FloatArray, count: int) -> tuple[float, int, float]:
     By the products (P, P) of the first `count` columns, the added ones and the residual. The
     squares left beside the first columns alone follow.
     """
-    sizes, known, rest = np.diag(products), np.s_[:count], np.s_[count:]
-    root = inverse_root(products[known, known], sizes[known])
-    cross = products[rest, known] @ root
-    left = products[rest, rest] - cross @ cross.T
-    root = inverse_root(left[:-1, :-1], sizes[count:-1])
-    along = root.T @ left[:-1, -1]
-    return float(along @ along), int(root.any(axis=0).sum()), float(left[-1, -1])
+    return _explained(_beside(products, count), np.diag(products)[count:-1])
 
 
 def gain_share(rows: FloatArray, count: int) -> float:
@@ -50,7 +46,30 @@ def gain_share(rows: FloatArray, count: int) -> float:
 
     The residual is the last column of the rows (R, P). Few rows tell none.
     """
-    if len(rows) - rows.shape[1] + 1 < len(rows) // 3:
-        return 0.0
-    gain, _, left = gain_of(rows.T @ rows, count)
-    return gain / left if left > 0.0 else 0.0
+    (share,) = gain_shares(rows, count, [np.arange(rows.shape[1] - count - 1)])
+    return share
+
+
+def gain_shares(rows: FloatArray, count: int, groups: Sequence[Index]) -> list[float]:
+    """Return the shares that groups of the added columns of rows (R, P) explain, each alone."""
+    products, shares = rows.T @ rows, []
+    left, sizes = _beside(products, count), np.diag(products)[count:]
+    for group in groups:
+        chosen = np.append(group, -1)
+        gain, _, whole = _explained(left[np.ix_(chosen, chosen)], sizes[group])
+        few = len(rows) - count - len(group) < len(rows) // 3
+        shares.append(0.0 if few or whole <= 0.0 else gain / whole)
+    return shares
+
+
+def _beside(products: FloatArray, count: int) -> FloatArray:
+    """Return the products of all but the first `count` columns, without what these explain."""
+    known, rest = np.s_[:count], np.s_[count:]
+    cross = products[rest, known] @ inverse_root(products[known, known], np.diag(products)[known])
+    return np.asarray(products[rest, rest] - cross @ cross.T)
+
+
+def _explained(left: FloatArray, sizes: FloatArray) -> tuple[float, int, float]:
+    root = inverse_root(left[:-1, :-1], sizes)
+    along = root.T @ left[:-1, -1]
+    return float(along @ along), int(root.any(axis=0).sum()), float(left[-1, -1])

@@ -291,7 +291,7 @@ def _cut(text: str, longest: int) -> str:
     glued = re.sub(r'(?<=\d) | (?=\d)', '\0', text)
     kept = textwrap.shorten(glued, longest, placeholder='').replace('\0', ' ')
     while kept.count('(') > kept.count(')'):
-        kept = kept.rpartition(' (')[0]
+        kept = kept.rpartition('(')[0].rstrip()
     return kept.rstrip(',;:')
 
 
