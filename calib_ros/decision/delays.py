@@ -279,7 +279,8 @@ def other_delay(problem: Problem, result: Identification) -> str:
         if abs(found - read) > 0.5 * Settings.max_gap:
             return (
                 f'joint values were read for measurements {read:.3f} s late, but these are about '
-                f'{found:.3f} s late: set delay to {found:.3f} and sample again'
+                f'{found:.3f} s late: set delay to {found:.3f} and sample again, once clocks '
+                'neither drift nor jump'
             )
     return ''
 
