@@ -67,12 +67,15 @@ def region_of(
         return None
     if incomplete:
         largest = min(largest, ALIKE * judge.correction(own) / np.sqrt(len(measured)))
-    shells = order[~inside & (far[order] <= largest)]
-    for shell in np.split(shells, range(SHELL, len(shells), SHELL)):
-        added = judge.products(rows[..., shell])
-        if not judge.risk(added, inner + added, mixture) < RISK:
+    first, last = (int(np.sum(far <= most)) for most in (limit, max(limit, largest)))
+    for begin in range(first, last, SHELL):
+        end = min(begin + SHELL, last)
+        added = shell = judge.products(rows[..., order[begin:end]])
+        if end - begin < SHELL:  # a few poses tell little: with the next within
+            shell = judge.products(rows[..., order[max(end - SHELL, 0) : end]])
+        if not judge.risk(shell, inner + added, mixture) < RISK:
             break
-        inner, limit = inner + added, float(far[shell[-1]])
+        inner, limit = inner + added, float(far[order[end - 1]])
     by_scale = 0.0
     if posterior.rival is not None:
         odds, mean, covariance = posterior.rival
