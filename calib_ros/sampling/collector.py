@@ -114,9 +114,13 @@ class Collector:
         streams = len(self.waiting) + len(given.pieces)
         if fullest + len(given) > self.settings.pose_buffer or streams > MOST_NAMES:
             return begin
-        newest = np.maximum.accumulate(np.where(given.joints, given.times, self._newest_ns))
         delay_ns = self.delay_ns - round(self.settings.delay * 1e9)  # beyond that of the slice
-        late = given.times - np.where(given.joints, 0, delay_ns) <= newest - self._late_ns
+        since = given.times - delay_ns  # what each message bears on
+        for key, places, stamps, _ in given.pieces:
+            if not isinstance(key, StreamKey):
+                since[places - given.begin] = self.track.bears_on(key, stamps)
+        newest = np.maximum.accumulate(np.where(given.joints, given.times, self._newest_ns))
+        late = since <= np.append(self._newest_ns, newest[:-1]) - self._late_ns
         return begin + int(np.argmax(np.append(late[begin:], True)))
 
     def take(self, given: Slice) -> None:

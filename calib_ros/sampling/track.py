@@ -24,8 +24,10 @@ from calib_ros.sampling.slices import SILENCE, Series, Stamps
 from calib_ros.settings import EXCEPTION
 
 APART = 'joint states too far apart'
-CAUSES = ('', 'no joint state before', 'no joint state after', APART)
-"""Why there are no joint values at a stamp; the first entry means there are."""
+CAUSES = ('', APART, 'no joint state before', 'no joint state after')
+"""Why there are no joint values at a stamp; the first entry means there are.
+
+Of several publishers of a joint the first cause counts, so none of one that became silent."""
 Brackets: TypeAlias = tuple[Index, Index, Index]
 """Causes (N,), and the indices of samples before and after each stamp."""
 
@@ -49,7 +51,8 @@ class Track:
         self._max_gap_ns = round(max_gap * 1e9)
         self._capacity = capacity
         self._parts: dict[tuple[int, ...], Rows] = {}
-        self._earlier = np.zeros(len(revolute))  # signs of last moves before the samples
+        self._earlier: dict[tuple[int, ...], FloatArray] = {}
+        """Signs (k,) of the last moves before the samples, by publisher."""
         self.horizon_ns = 0  # samples before this stamp have been dropped
         self.noisiest = Counter[int]()  # how often each joint had most noise at rest
 
@@ -93,7 +96,19 @@ class Track:
         rows = self._parts.get(columns)
         if rows is None:
             rows = self._parts[columns] = Rows(len(columns), self._capacity)
+            self._earlier[columns] = np.zeros(len(columns))
         rows.extend(stamps, values)
+
+    def bears_on(self, columns: tuple[int, ...], stamps: Stamps) -> Stamps:
+        """Return since when (M,) joint values change as samples at stamps (M,) come by turns.
+
+        Since the last but one before it that had come by then (see `interpolated`).
+        """
+        known = self._parts[columns].stamps if columns in self._parts else stamps[:0]
+        every = np.concatenate([np.zeros(2, dtype=np.int64), np.sort(known), stamps])
+        newest = np.maximum.accumulate(every)
+        second = np.maximum.accumulate(np.minimum(every[1:], newest[:-1]))
+        return np.asarray(second[np.maximum(np.searchsorted(newest, stamps), 2) - 2])
 
     def sort(self) -> tuple[int, int]:
         """Sort all samples, as `Rows.sort`."""
@@ -117,17 +132,17 @@ class Track:
         """Return the signs (N, n) of the last moves before joint values (N, n) at stamps (N,)."""
         found = np.zeros(joints.shape)
         for index, rows, (why, first, _) in self._around(stamps):
-            revolute, earlier = self._revolute[index], self._earlier[index]
+            revolute, earlier = self._revolute[index], self._earlier[tuple(index)]
             signs = last_moves(rows.values, first, joints[:, index], earlier, revolute)
-            found[np.ix_(why == 0, index)] = signs[why == 0]
+            known = (signs != 0.0) & (why == 0)[:, np.newaxis]
+            found[:, index] = np.where(known, signs, found[:, index])
         return found
 
     def causes(self, stamps: Stamps) -> Index:
         """Return why there are no joint values at stamps (N,), as indices of CAUSES."""
-        cause = np.full((len(stamps), len(self._revolute)), 1, dtype=np.intp)
+        cause = np.full((len(stamps), len(self._revolute)), len(CAUSES) - 1, dtype=np.intp)
         for index, _, (why, *_) in self._around(stamps):
-            worse = cause[:, index] != 0
-            cause[:, index] = np.where(worse, why[:, np.newaxis], cause[:, index])
+            cause[:, index] = np.minimum(cause[:, index], why[:, np.newaxis])
         return np.asarray(cause.max(axis=1, initial=0))
 
     def _around(self, stamps: Stamps) -> Iterator[tuple[list[int], Rows, Brackets]]:
@@ -146,7 +161,7 @@ class Track:
         hit = known[last] == stamps
         first = np.where(hit, last, np.maximum(after - 1, 0))
         apart = known[last] - known[first] > self._max_gap_ns
-        cause = np.select([hit, after == len(known), after == 0, apart], [0, 2, 1, 3])
+        cause = np.select([hit, after == len(known), after == 0, apart], [0, 3, 2, 1])
         return cause.astype(np.intp), first.astype(np.intp), last.astype(np.intp)
 
     def standing(self, still: float, window: float) -> Stamps:
@@ -227,9 +242,9 @@ class Track:
             if cut <= 0:
                 continue
             cuts = np.array([cut])
-            earlier, revolute = self._earlier[index], self._revolute[index]
+            earlier, revolute = self._earlier[columns], self._revolute[index]
             signs = last_moves(rows.values, cuts, rows.values[cuts], earlier, revolute)
-            self._earlier[index] = signs[0]
+            self._earlier[columns] = signs[0]
             rows.keep(slice(cut, None))
             dropped += cut
         self.horizon_ns = max(self.horizon_ns, before_ns)

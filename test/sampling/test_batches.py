@@ -13,7 +13,9 @@ from calib_ros import CalibrationSession, Settings, load_chain
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.sampling.batches import batches, feed
+from calib_ros.sampling.collector import ADVANCE_NS
 from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.slices import Part
 from calib_ros.sampling.sources import Source
 from calib_ros.sampling.streams import Stream
 
@@ -25,6 +27,7 @@ TRACKER = Stream('tracker', POSE, Source('tracker', POSE))
 CAMERA = Stream('camera', POINT, Source('camera', POINT, device='camera'))
 START = 1_700_000_000_000_000_000
 RARE = 0.003
+WHOLE = tuple(range(6))
 
 
 def written(stream, message):
@@ -120,6 +123,56 @@ def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
     many.finish()
     assert outcome(one) == outcome(many)
     assert one.samples
+
+
+def played(come, size):
+    """Return what a session makes of (publisher, time [s]) in the order in which they come.
+
+    The publisher names joints by index; none is the tracker.
+    """
+    session = CalibrationSession(ARM, Settings(mode='continuous', delay=0.001))
+    for begin in range(0, len(come), size):
+        some, parts = come[begin : begin + size], []
+        for publisher in {each for each, _ in some}:
+            places = np.array([k for k, each in enumerate(some) if each[0] == publisher])
+            times = np.array([some[k][1] for k in places])
+            numbers = 0.5 * np.sin(9.0 * times[:, np.newaxis] + np.arange(6.0))
+            names, source, columns = ('world',), TRACKER.source, range(3)
+            if publisher is not None:
+                names, source = ('', *(ARM.joint_names[j] for j in publisher)), None
+                columns = publisher
+            parts.append(Part(places, source, names, stamps(times), numbers[:, list(columns)]))
+        session.take(parts)
+    session.finish()
+    return outcome(session)
+
+
+@pytest.mark.parametrize('others', [((0, 1, 2), (3, 4, 5)), ((3, 4, 5), (2, 1, 0))])
+def test_a_publisher_that_became_silent_gives_no_cause(others):
+    """Live it had been forgotten by then; signs of the last moves were of any publisher."""
+    times = np.arange(0.0, 6.0, 0.04)
+    come = [
+        (publisher, time)
+        for time in times.tolist()
+        for publisher in (WHOLE, *others, None)
+        if time <= 2.0 or publisher is None or (publisher != WHOLE and not 2.42 < time < 2.9)
+    ]
+    account, *_ = one = played(come, 1)
+    assert one == played(come, len(come))
+    assert account.dropped['measurements: joint states too far apart'] == 13
+
+
+def test_a_late_joint_state_changes_nothing_that_is_settled():
+    """The one beside it was interpolated anew in a batch, and joint values differed."""
+    times = np.arange(0.0, 3.0, 0.04).tolist()
+    due = 3 * round(ADVANCE_NS / 4e7 + 0.5)  # a round settles what is older by the lateness
+    late = due - round(Settings.lateness / 0.04 - 0.5)
+    come = [(WHOLE, time) for time in times if time != times[late]]
+    come.insert(due, (WHOLE, times[late]))
+    come.insert(late, (None, times[due] - Settings.lateness - 0.0005))
+    one = played(come, 1)
+    assert one == played(come, len(come))
+    assert one[1]
 
 
 def test_a_clock_that_moves_is_told_alike_however_many_messages_come_at_once(monkeypatch):

@@ -8,7 +8,9 @@ from hypothesis import given, strategies as st
 from tracked import BOTH, MAX_GAP, MS, add, at, came, causes, fill, filled, track
 
 from calib_ros.estimation.configurations import STILL
-from calib_ros.sampling.track import APART, CAUSES
+from calib_ros.sampling.track import CAUSES
+
+_, APART, BEFORE, AFTER = CAUSES
 
 
 def words(made, *ms):
@@ -69,7 +71,7 @@ def test_stamps_of_today_are_interpolated_to_the_nanosecond():
     np.testing.assert_allclose(made.at(np.array([start + 3])).joints, [[0.3, 0.6]], atol=1e-15)
 
 
-@pytest.mark.parametrize(('gap_ns', 'why'), [(100 * MS, ''), (100 * MS + 1, CAUSES[3])])
+@pytest.mark.parametrize(('gap_ns', 'why'), [(100 * MS, ''), (100 * MS + 1, APART)])
 def test_samples_further_apart_than_max_gap_are_not_joined(gap_ns, why):
     made = track()
     for stamp_ns in (200 * MS, 200 * MS + gap_ns):
@@ -79,8 +81,8 @@ def test_samples_further_apart_than_max_gap_are_not_joined(gap_ns, why):
 
 def test_nothing_is_extrapolated():
     made = filled([(100, (0.0, 0.0)), (110, (0.0, 0.0))])
-    assert words(made, 99, 100, 105, 110, 111) == [CAUSES[1], '', '', '', CAUSES[2]]
-    assert words(track(), 99) == [CAUSES[1]]
+    assert words(made, 99, 100, 105, 110, 111) == [BEFORE, '', '', '', AFTER]
+    assert words(track(), 99) == [AFTER]
 
 
 @pytest.mark.parametrize(('first', 'second'), [(3.1, -3.1), (-3.1, 3.1)])
@@ -179,14 +181,14 @@ def test_publishers_of_parts_make_one_arm():
     np.testing.assert_allclose(motion.velocity, [[1.0, -2.0, -1.0]] * 2, atol=1e-9)
     assert made.newest_ns == 483 * MS
     assert made.missing == ()
-    assert words(made, 2, 484) == [CAUSES[1], CAUSES[2]]
+    assert words(made, 2, 484) == [BEFORE, AFTER]
 
 
 def test_a_joint_that_nobody_names_is_missing():
     made = filled([(0, (0.0,)), (10, (0.0,))], columns=(1,))
     assert made.missing == (0,)
     assert made.silent(MS) == ()
-    assert words(made, 5) == [CAUSES[1]]
+    assert words(made, 5) == [AFTER]
     assert made.samples()[0].tolist() == []
 
 
@@ -277,7 +279,7 @@ def test_release_keeps_the_last_sample_and_the_signs():
 def test_in_a_pause_joint_states_are_too_far_apart_whatever_was_let_go():
     made = filled([(ms, (0.0, 0.0)) for ms in (*range(10), *range(900, 910))])
     assert made.release(500 * MS) == 9
-    assert words(made, 5, 600, 905) == [CAUSES[1], APART, '']
+    assert words(made, 5, 600, 905) == [BEFORE, APART, '']
 
 
 @pytest.mark.parametrize('capacity', [1, 2, 3, 4, 5, 100])
