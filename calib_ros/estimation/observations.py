@@ -261,6 +261,7 @@ class Observations(Shown):
         """Return the measurements with the joint values a delay [s] (N,) before the stamps.
 
         By velocity and acceleration; without them the arm was at rest and nothing changes.
+        Unchecked: the solver asks for it again and again.
         """
         if self.velocity is None or delay is None:
             return self
@@ -272,7 +273,7 @@ class Observations(Shown):
         if self.acceleration is not None:
             joints = joints + 0.5 * more**2 * self.acceleration
             velocity = velocity - more * self.acceleration
-        return replace(self, joints=joints, velocity=velocity, delay=delays)
+        return self.changed(joints=joints, velocity=velocity, delay=delays)
 
     @property
     def given(self) -> FloatArray:
