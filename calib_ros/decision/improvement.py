@@ -17,8 +17,8 @@ from calib_ros.decision.trials import position_fault_limit
 from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, CONFIDENT
 from calib_ros.estimation.problem import Problem
-from calib_ros.kinematics.se3 import Flags
-from calib_ros.shown import rounded
+from calib_ros.kinematics.se3 import Flags, norms
+from calib_ros.shown import rounded, rows_in_words
 
 
 def _gain(
@@ -53,6 +53,7 @@ def gain_refusals(
             text += f'{rounded(chance)} mm'
         if validation.kind == 'stations':
             text += '; most joints stood still within each: move all joints from pose to pose'
+        text += _without_worst(problem, validation)
         yield Reason(Rule.GAIN, f'no gain on held-out poses beyond chance ({text})')
     elif result.chance is not None and result.chance > 1.0 - CONFIDENT:
         yield Reason(
@@ -85,6 +86,24 @@ def gain_refusals(
                 'true there'
             )
         yield Reason(Rule.REGION, text)
+
+
+def _without_worst(problem: Problem, validation: Comparison) -> str:
+    """Return which pose alone hides a gain, certain without it, as the end of a sentence."""
+    after, judged = validation.after, validation.deciding
+    far = np.where(judged, norms(after.position), 0.0)
+    worst = int(far.argmax())
+    rest = judged & (after.configurations != after.configurations[worst])
+    gain, limit = _gain(validation, 'position', rest, CERTAIN)
+    if not gain > limit:
+        return ''
+    sets = problem.sets if validation.repeated is None else problem.judging
+    ends = np.cumsum([len(each) for each in sets])
+    number = int(np.searchsorted(ends, worst, 'right'))
+    seen, row = sets[number], worst - int(ends[number])
+    name = rows_in_words([row + len(seen)], seen.stamps_ns, problem.of_messages)
+    off = rounded(1e3 * far[worst])
+    return f'; without {name}, {off} mm off, there is one: measure it again'
 
 
 def harm_refusals(validation: Comparison, may_be_rounding: bool, helps: bool) -> Iterator[Reason]:

@@ -20,6 +20,7 @@ from calib_ros.decision.residuals import Residuals, residuals
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import minimise
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.parameter import Parameter
 
@@ -81,11 +82,11 @@ def rules_of(before, after, judged):
     return {each.rule for each in refused(before, after, judged)}
 
 
-def refused(before, after, judged, largest_error=0.01, **change):
+def refused(before, after, judged, largest_error=0.01, sets=(), **change):
     """Return the refusals by position errors (N, 3) [m] on pairs that were left out."""
     numbers, none = np.arange(len(judged)), np.full((len(judged), 3), np.nan)
     parts = [Residuals(x, none, numbers, none[:, :2]) for x in (before, after)]
-    problem = SimpleNamespace(largest_length=1.0, largest_angle=1.0, sets=())
+    problem = SimpleNamespace(largest_length=1.0, largest_angle=1.0, sets=sets, of_messages=False)
     problem.largest_error = largest_error
     given = {'converged': True, 'parameters': (), 'chance': None, 'region': 1, 'surprise': 0.0}
     judging = Comparison(*parts, judged)
@@ -93,6 +94,19 @@ def refused(before, after, judged, largest_error=0.01, **change):
     known['noise'] = SimpleNamespace(position=1.0)
     result = SimpleNamespace(**known | given | change)
     return [*refusals(problem, result, None, False, True)]
+
+
+def test_a_pose_that_alone_hides_the_gain_is_named(rng):
+    """More poses were asked for, although a single one, at the end of a joint, was wrong."""
+    away = rng.normal(scale=1e-3, size=(40, 3))
+    left, lines = 0.4 * away, 10**9 * np.arange(2, 22)
+    left[27] = 8e-3, 0.0, 0.0
+    seen = Observations.from_arrays(np.zeros((20, 6)), np.zeros((20, 3)))
+    seen = replace(seen, stamps_ns=lines, distances=np.zeros(20))  # these tell no size of an arm
+    told = refused(away, left, np.ones(40, bool), sets=(seen, seen))
+    assert [each.rule for each in told] == [Rule.GAIN]
+    assert told[0].endswith('; without line 9, 8.000 mm off, there is one: measure it again)')
+    assert 'without' not in refused(away, away[::-1], np.ones(40, bool))[0]
 
 
 @pytest.mark.parametrize(('before', 'rules'), [(2.9e-3, [Rule.REGION]), (3.1e-3, [])])
