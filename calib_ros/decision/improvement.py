@@ -95,11 +95,11 @@ def _without_worst(problem: Problem, validation: Comparison) -> str:
     worst = int(far.argmax())
     rest = judged & (after.configurations != after.configurations[worst])
     gain, limit = _gain(validation, 'position', rest, CERTAIN)
-    if not gain > limit:
-        return ''
     sets = problem.sets if validation.repeated is None else problem.judging
     ends = np.cumsum([len(each) for each in sets])
     number = int(np.searchsorted(ends, worst, 'right'))
+    if not gain > limit or sets[number].pixels is not None:  # rows are points of an image
+        return ''
     seen, row = sets[number], worst - int(ends[number])
     name = rows_in_words([row + len(seen)], seen.stamps_ns, problem.of_messages)
     off = rounded(1e3 * far[worst])
