@@ -106,8 +106,8 @@ def test_without_motion_there_is_no_delay():
 def test_errors_of_time_are_told(jitter, smoothing, said):
     """In motion they pass for errors of the arm, and an arm without any may look better for it."""
     true, _, rng = true_cell(0)
-    motion = stops(UR10E.random_joints(8, rng) * 0.5, 1.5, 0.05)
-    joint_times, times = np.arange(0.0, 12.0, 0.005), np.arange(0.05, 11.7, 0.15)
+    motion = stops(UR10E.random_joints(6, rng) * 0.5, 1.5, 0.05)
+    joint_times, times = np.arange(0.0, 9.0, 0.005), np.arange(0.05, 8.7, 0.15)
     seen = measure(true, motion(times), rng, *NOISE)
     joints = motion(joint_times)
     for k in range(1, len(joints)) if smoothing else ():
