@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables put together wrongly: rows lost, repeated, or computed instead of measured.
+"""Tables put together wrongly: rows lost, or computed instead of measured.
 
 A row missing in one of two tables put side by side mismatches later rows: one shift s of the joint
 values fits the measurements before a row k, another from there on, and one of them is zero. Base
@@ -83,37 +83,6 @@ def row_loss(
                 error = float(np.median(pieced[np.isfinite(pieced)]))
                 best = Suspect(f'{where} {rows_away(after or before)}', remedy), error
     return best
-
-
-def repeating(
-    chain: Chain, seen: Observations, largest: float, of_messages: bool
-) -> Suspect | None:
-    """Return rows that repeat the measurement, or the joint values, of the row before them.
-
-    They miss the chain, and the other ones moved meanwhile, by more than `largest` [m]; so do most
-    that repeat, or some of the poses measured again and again have gross errors.
-    """
-    if seen.socket:
-        return None
-    arm = flange(chain, seen)
-    far = sample_errors(chain, seen, arm) > largest
-    poses = np.column_stack([seen.given, seen.rotations.reshape(-1, 9)])
-    for what, values, others in (
-        ('the measurement is', poses, arm[:, :3, 3]),
-        ('the joint values are', seen.joints, seen.given),
-    ):
-        moved = np.linalg.norm(np.diff(others, axis=0), axis=1) > largest
-        again = (np.diff(values, axis=0) == 0.0).all(axis=1)
-        rows = 1 + np.flatnonzero(again & moved & far[1:])
-        if len(rows) >= max(LEAST_ASIDE, 0.5 * np.count_nonzero(again)):
-            names = rows_in_words(rows.tolist(), seen.stamps_ns, of_messages)
-            return Suspect(
-                f'{what} repeated in {names} while the rest moved',
-                'leave these rows out, and see why its source stood still',
-                rank=0,
-                published='see why its publisher repeats old values',
-            )
-    return None
 
 
 def computed_rows(problem: Problem) -> str:

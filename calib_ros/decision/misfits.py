@@ -6,32 +6,28 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from scipy import special
 
-from calib_ros.decision.residuals import residuals
 from calib_ros.decision.steps import EXPLAINED
-from calib_ros.decision.trials import sample_errors
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.considered import travels
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.gain import gain_share
 from calib_ros.estimation.gross_errors import SUSPICIOUS
-from calib_ros.estimation.levels import LEAST_ASIDE, NEARER, SURE, TELLING
+from calib_ros.estimation.levels import NEARER, SURE, TELLING
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.start import flange
 from calib_ros.estimation.system import stacked
 from calib_ros.estimation.visits import numbered
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray, norms
+from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXCEPTION
-from calib_ros.shown import rows_in_words, two_digits
+from calib_ros.shown import two_digits
 
 ADVICE = (
     'device errors do not depend on joint values, so the arm has an effect that the model lacks. '
@@ -72,67 +68,6 @@ def arms_own(fitted: Fitted) -> str | None:
         if all_of_it > 10.0 * STILL and part < EXCEPTION * all_of_it:
             return f'{name} moves only in poses set aside as gross errors: {ADVICE}'
     return None
-
-
-def frozen_joints(fitted: Fitted) -> tuple[tuple[str, ...], list[Observations]]:
-    """Return which joint values repeat in gross errors that a motion of this joint explains.
-
-    A joint that rests moves in no pose, and one whose zero is off is off by one angle. The sets
-    follow, with the values that explain the errors: what else moved shows in these.
-    """
-    chain, told, sets = fitted.chain, list[str](), list(fitted.problem.sets)
-    for number, (each, good) in enumerate(zip(sets, fitted.robust.inliers, strict=True)):
-        if each.socket or each.inverse or each.distances is not None or each.pixels is not None:
-            continue
-        again = np.abs(np.diff(each.joints, axis=0, prepend=np.nan)) <= ROUNDING
-        odd, joints = ~good & ~again.all(axis=1), each.joints.copy()
-        for k, joint in enumerate(chain.joints):
-            rows, found = np.flatnonzero(again[:, k] & odd), list[int]()
-            if len(rows) < LEAST_ASIDE:
-                continue
-            offsets, before, after = _moved_alone(chain, each.select(rows), k)
-            runs = np.cumsum(~again[:, k])[rows]
-            for run in np.unique(runs):
-                mine = runs == run
-                wide = np.ptp(offsets[mine]) > NEARER * np.abs(offsets[mine]).max()
-                better = np.linalg.norm(after[mine]) < EXCEPTION * np.linalg.norm(before[mine])
-                if mine.sum() >= LEAST_ASIDE and wide and better:
-                    found += range(rows[mine][0], rows[mine][-1] + 1)
-                    joints[rows[mine], k] += offsets[mine]
-            if found:
-                where = rows_in_words(found, each.stamps_ns, fitted.problem.of_messages)
-                told.append(
-                    f'{joint.name} moved in {where}, but its values repeat there: look for the '
-                    "cause in the robot's driver or the table, and measure these poses again"
-                )
-                sets[number] = replace(each, joints=joints)
-    return tuple(told), sets
-
-
-def _moved_alone(
-    chain: Chain, seen: Observations, k: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return by how much values of joint k (N,) are off, and errors [m] before and after that.
-
-    By orientations, if these are measured; else about its axis, or along it.
-    """
-    joint, left = chain.joints[k], residuals(chain, seen)
-    model = ErrorModel(chain, [joint.driven], seen.base, seen.tool)
-    along, axis = np.split(model.jacobian(seen.joints, seen.approach)[:, :, 0], 2, axis=1)
-    arm = np.cross(along, axis)
-    offsets = np.arctan2(
-        np.einsum('nc,nc->n', along, left.position),
-        (arm**2).sum(axis=1) + np.einsum('nc,nc->n', arm, left.position),
-    )
-    turned = np.einsum('nc,nc->n', axis, left.orientation)
-    offsets = np.where(seen.oriented, turned, offsets)
-    if joint.type == 'prismatic':
-        offsets = np.einsum('nc,nc->n', along, left.position)
-    joints, offsets = seen.joints.copy(), joint.sign * offsets
-    joints[:, k] += offsets
-    both = seen, seen.changed(joints=joints)
-    before, after = (sample_errors(chain, each, flange(chain, each)) for each in both)
-    return offsets, before, after
 
 
 def loose_target(sets: Sequence[Observations]) -> str:

@@ -21,6 +21,7 @@ import numpy as np
 
 from calib_ros.decision import lost_rows, orders
 from calib_ros.decision.diagnosis import Diagnosis
+from calib_ros.decision.frozen import repeating
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import FIRST, ORIENTATIONS, hidden, suspects
@@ -82,7 +83,7 @@ def with_mistake(problem: Problem, result: Identification) -> Identification:
         follow = (Rule.MISTAKE, Rule.REGION)
         others = (each for each in result.refusals if each.rule not in follow)
         return replace(result, refusals=(found.reason, *others), remarks=())
-    return replace(result, remarks=(str(found), *result.remarks))
+    return replace(result, remarks=tuple(dict.fromkeys([str(found), *result.remarks])))
 
 
 def _suspicious(problem: Problem, result: Identification) -> bool:
@@ -281,8 +282,10 @@ def _of_tables(
 
 
 def _of_repeats(problem: Problem, chain: Chain, seen: Observations) -> Diagnosis | None:
-    odd = lost_rows.repeating(chain, seen, fault_limit(problem), problem.of_messages)
-    return None if odd is None else Diagnosis((odd,), np.nan, np.nan)
+    largest = fault_limit(problem)
+    far = sample_errors(chain, seen, flange(chain, seen)) > largest
+    odd = repeating(chain, seen, far, largest, problem.of_messages)
+    return None if odd is None else Diagnosis(odd[:1], np.nan, np.nan)
 
 
 def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Diagnosis | None:

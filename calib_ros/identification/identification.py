@@ -21,7 +21,8 @@ from calib_ros.decision.acceptance import oddities, refusals
 from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.decision.delays import timed
 from calib_ros.decision.drift import chance_of_gain
-from calib_ros.decision.misfits import arms_own, coupling_share, frozen_joints, outliers_of
+from calib_ros.decision.frozen import frozen_sources
+from calib_ros.decision.misfits import arms_own, coupling_share, outliers_of
 from calib_ros.decision.region import Region
 from calib_ros.decision.result import Identification
 from calib_ros.decision.risk import region_of
@@ -108,7 +109,7 @@ def _identified(
     judged = compare(before.chain, chain, problem.sets, ~robust.outliers, uncertainty.together)
     parameters = parameter_rows(fitted, uncertainty)
     region, scaled = _region(inference, posterior, wider)
-    stuck, thawed = frozen_joints(fitted)
+    stuck, thawed = frozen_sources(fitted)
     wrong, corrected = wrong_distances(fit(problem.with_sets(thawed)) if stuck else fitted)
     result = Identification(
         chain=chain,
