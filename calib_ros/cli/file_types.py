@@ -31,6 +31,7 @@ KIND_OF_SUFFIX = {
     **dict.fromkeys(('.xls', '.xlsb', '.ods', '.numbers'), 'workbook'),
 }
 IN_FOLDERS = (('metadata.yaml', 'bag'), ('result.json', 'result'), ('calibration.yaml', 'result'))
+IN_ANY_FOLDER = (('bag', 'bag'), ('image', 'images'), ('table', 'tables'))
 FILE_KINDS = {
     'bag': ('a bag', 'use identify or verify, or bag2csv to make a table'),
     'table': ('a table', 'use identify or verify, or csv2bag to make a bag'),
@@ -44,6 +45,7 @@ FILE_KINDS = {
     'result': ('the result of identify', 'use workspace, or give it as --calibration'),
     'image': ('an image', 'use calib_ros images on its folder'),
     'images': ('a folder of images', 'use calib_ros images'),
+    'tables': ('a folder of tables', 'use identify or verify on the tables in it (FOLDER/*.csv)'),
     'workbook': ('a workbook of another kind', 'save it as .xlsx or CSV'),
     'archive': ('an archive', 'unpack it and give what is in it'),
     'report': ('a report', 'read it; calibration.yaml beside it is the result'),
@@ -59,8 +61,8 @@ def kind_of(path: Path) -> str:
     if path.is_dir():
         names = [each.name for each in path.iterdir()]
         found = [kind for name, kind in IN_FOLDERS if name in names]
-        inside = {'bag': 'bag', 'image': 'images'}
-        found += [inside[kind] for kind in map(_by_suffix, names) if kind in inside]
+        inside = {*map(_by_suffix, names)}
+        found += [kind for each, kind in IN_ANY_FOLDER if each in inside]
         return found[0] if found else ''
     begin = b''
     if path.is_file():

@@ -124,6 +124,7 @@ def bad_inputs():
     )
     yield 'no program', ('compare', 'start.dtx', 'none'), "start.dtx is a program in a robot's own"
     yield 'images as a table', (*bag_of, 'shots'), 'shots is a folder of images, but identify tak'
+    yield 'a folder of tables', (*bag_of, 'tables'), 'or verify on the tables in it (FOLDER/*.csv)'
     yield 'a result as a table', (*bag_of, 'refused/result.json'), 'is a report, but identify'
     yield 'demo, into a file', ('demo', '--out', 'empty', '--poses', '5'), 'empty'
 
@@ -156,9 +157,9 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     (tmp_path / 'poses.XLSX').write_bytes(b'PK\3\4\0')
     (tmp_path / 'poses.zip').write_bytes(b'PK\3\4\0')
     (tmp_path / 'shot.png').write_bytes(b'\x89PNG\xff')
-    for folder, file in (('folder', ''), ('refused', 'result.json'), ('shots', '1.pgm')):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / (file or 'notes')).write_text('{}')
+    for file in ('folder/notes', 'refused/result.json', 'shots/1.pgm', 'tables/monday.csv'):
+        (tmp_path / file).parent.mkdir()
+        (tmp_path / file).write_text('{}')
     status, _, err = run(*arguments)
     assert status == 1
     assert err.startswith('calib_ros: ')
