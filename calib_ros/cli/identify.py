@@ -61,7 +61,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         found = identified(options, screen, loaded, *read)
         if options.out is not None:
             contents |= result_files(found, options, screen)
-    shown = () if found.result.accepted and not options.json else words.other_remarks(found.result)
+    shown = () if found.result.accepted and not options.json else found.result.remarks
     for warning in (*found.loaded.warnings, *shown):
         screen.warn(warning)
     if options.json:

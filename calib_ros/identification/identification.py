@@ -74,9 +74,9 @@ def identify(
     try:
         problem, late = timed(problem)
         result = _identified(problem, simpler, progress)
-        result = replace(result, remarks=(*late, *result.remarks))
         told = sorted(result.refusals, key=lambda each: each.rule.value)
-        return replace(result, refusals=tuple(told))
+        remarks = (each for each in (*late, *result.remarks) if each not in told)
+        return replace(result, refusals=tuple(told), remarks=tuple(remarks))
     except np.linalg.LinAlgError as err:
         if found := mistakes.diagnose(problem):
             raise InputError(f'the measurements do not fit the arm: {found}') from err

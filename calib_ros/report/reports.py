@@ -68,10 +68,10 @@ def identification_report(
     fitted += words.notes(result)[:1] if result.chain.effects else []
     scale = f'scale checked to {1e6 * problem.sigma_scale:g} ppm'
     scale = scale if problem.sigma_scale else 'scale not checked'
-    corrected, notes = 'none: not accepted', words.other_remarks(result)
+    corrected, notes = 'none: not accepted', result.remarks
     if result.accepted:
         corrected = table_hash(result.chain)
-        notes = [*filter(None, (words.disturbed_in_words(result.noise),))]
+        notes = tuple(filter(None, [words.disturbed_in_words(result.noise)]))
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,

@@ -55,7 +55,7 @@ def summary(
     if result.unidentifiable:
         text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'
     text = '; '.join((text, *notes(result)))
-    if more := (*warnings, *other_remarks(result)):
+    if more := (*warnings, *result.remarks):
         text += f'; note: {"; ".join(more)}'
     if result.accepted:
         return f'{verdict(result)}; {text}'
@@ -111,11 +111,6 @@ def fitted_to(result: Identification) -> str:
     """Return what was fitted, and how much of it is outliers."""
     outliers = f', {of_them(len(result.outliers), "outlier")} with little or no weight'
     return fitted_data(result) + outliers * bool(result.outliers)
-
-
-def other_remarks(result: Identification) -> list[str]:
-    """Return the remarks that do not repeat a refusal."""
-    return [each for each in result.remarks if each not in map(str, result.refusals)]
 
 
 def notes(result: Identification) -> list[str]:

@@ -211,7 +211,7 @@ class Identifying:
         if given.cause and not telling:
             first, brief = sentence(given.cause.text), given.cause.status
         numbers = {each: given.number_of(each) for each in result.outliers}
-        hint = next(iter((*loaded.warnings, *words.other_remarks(result))), '')
+        hint = next(iter((*loaded.warnings, *result.remarks)), '')
         moved, nearer = _moved(result, given), _nearer(result, given.since)
         self.last = words.summary(result, numbers, loaded.warnings, first)
         if moved and not (result.step and result.step.slow):  # else told already
