@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 from fits import NOISE, SIGMAS, UR10E, arm
 
-from calib_ros import Problem, identify, load_chain
+from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision import steps
-from calib_ros.decision.moved import ASIDE, BEFORE_THAT, FROM_THERE, IF_IN_ORDER, Step
+from calib_ros.decision.moved import (
+    ASIDE,
+    BEFORE_THAT,
+    FROM_THERE,
+    IF_IN_ORDER,
+    Step,
+    looks_alike,
+    thing_of,
+)
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
@@ -240,3 +248,29 @@ def test_a_move_whose_size_hardly_shows_is_not_told():
 def test_a_move_beside_one_whose_size_hardly_shows_is_told(monkeypatch):
     monkeypatch.setattr(steps, '_step_of', lambda scan, found, k: (None, FRAME)[k])
     assert steps._described(None, SimpleNamespace(stops=(3, 9)), False) == FRAME
+
+
+@pytest.mark.parametrize(
+    ('changed', 'device'),
+    [
+        ({'socket': True}, 'the socket'),
+        ({'distances': np.ones(3)}, 'the measuring device, its zero'),
+        ({'velocity': np.ones((3, 6))}, 'the measuring device, its clock'),
+        ({'distances': np.zeros(3), 'plane': True}, 'the plane'),
+    ],
+)
+def test_what_stands_beside_the_robot_is_named(changed, device):
+    seen = replace(Observations.from_arrays(np.zeros((3, 6)), np.zeros((3, 3))), **changed)
+    assert thing_of('base', seen) == f"{device} or the robot's foot"
+    problem, first = SimpleNamespace(chain=UR10E, sets=[seen]), device.partition(',')[0]
+    told = looks_alike(problem, UR10E.joint_names[0])  # no zero, and no clock, turns
+    assert told.startswith(f"{first} or the robot's foot turned about the axis")
+
+
+@pytest.mark.parametrize('changed', [{'inverse': True}, {'on_flange': True}])
+def test_what_a_device_on_the_flange_sees_stands_beside_the_robot(changed):
+    seen = replace(Observations.from_arrays(np.zeros((3, 6)), np.zeros((3, 3))), **changed)
+    assert thing_of('tool', seen) == 'the measuring device'
+    assert thing_of('base', seen) == "the target or the robot's foot"
+    assert thing_of('base', seen, several=True) == "the targets or the robot's foot"
+    assert thing_of('elbow', seen) == 'the joint'

@@ -13,7 +13,7 @@ from in_sockets import cell, led_to
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.decision import moved, scan, steps
-from calib_ros.decision.moved import looks_alike, place_of, thing_of
+from calib_ros.decision.moved import place_of
 from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
@@ -381,20 +381,3 @@ def test_a_joint_that_seldom_moves_is_told_if_it_moved_just_before_a_step(places
         sets=[None], numbers=[np.arange(45)], joints=lambda _: joints, chain=chain
     )
     assert steps._turned(scanned, places) == turned
-
-
-@pytest.mark.parametrize(
-    ('changed', 'device'),
-    [
-        ({'socket': True}, 'the socket'),
-        ({'distances': np.ones(3)}, 'the measuring device, its zero'),
-        ({'velocity': np.ones((3, 6))}, 'the measuring device, its clock'),
-        ({'distances': np.zeros(3), 'plane': True}, 'the plane'),
-    ],
-)
-def test_what_stands_beside_the_robot_is_named(changed, device):
-    seen = replace(Observations.from_arrays(np.zeros((3, 6)), np.zeros((3, 3))), **changed)
-    assert thing_of('base', seen) == f"{device} or the robot's foot"
-    problem, first = SimpleNamespace(chain=UR10E, sets=[seen]), device.partition(',')[0]
-    told = looks_alike(problem, UR10E.joint_names[0])  # no zero, and no clock, turns
-    assert told.startswith(f"{first} or the robot's foot turned about the axis")
