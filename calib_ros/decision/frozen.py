@@ -17,7 +17,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.start import flange
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.se3 import ROUNDING, Flags, FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, Flags, FloatArray, norms
 from calib_ros.settings import EXCEPTION
 from calib_ros.shown import rows_in_words
 
@@ -25,10 +25,10 @@ from calib_ros.shown import rows_in_words
 def repeating(
     chain: Chain, seen: Observations, far: Flags, largest: float, of_messages: bool
 ) -> tuple[Suspect, list[int]] | None:
-    """Return rows that repeat the measurement, or the joint values, of the row before them.
+    """Return rows that repeat the measurement, or the joint values, of a row before them.
 
-    They are `far` (N,) from the chain, and the others moved by more than `largest` [m]; so do most
-    that repeat, or some of the poses measured again and again have gross errors.
+    They are `far` (N,) from the chain, and the others moved by more than `largest` [m] since then;
+    so do most that repeat, or some of the poses measured again and again have gross errors.
     """
     if seen.socket:
         return None
@@ -37,9 +37,10 @@ def repeating(
         ('the measurement is', poses, flange(chain, seen)[:, :3, 3]),
         ('the joint values are', seen.joints, seen.given),
     ):
-        moved = np.linalg.norm(np.diff(others, axis=0), axis=1) > largest
-        again = (np.diff(values, axis=0) == 0.0).all(axis=1)
-        rows = (1 + np.flatnonzero(again & moved & far[1:])).tolist()
+        again = np.append(False, (np.diff(values, axis=0) == 0.0).all(axis=1))
+        fresh = np.maximum.accumulate(np.where(again, 0, np.arange(len(seen))))
+        moved = norms(others - others[fresh]) > largest
+        rows = np.flatnonzero(again & moved & far).tolist()
         if len(rows) >= max(LEAST_ASIDE, 0.5 * np.count_nonzero(again)):
             stale = Suspect(
                 f'{what} repeated in {rows_in_words(rows, seen.stamps_ns, of_messages)} while the '

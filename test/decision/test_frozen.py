@@ -52,6 +52,18 @@ def test_a_source_that_repeats_its_last_value_did_not_move(part, unsearched):
     assert found.step is None
 
 
+def test_a_device_that_stands_still_while_the_arm_moves_slowly_is_named(rng, unsearched):
+    """From row to row the arm moved by less than it may be off."""
+    slowly = np.full(6, 4e-3) * np.arange(12)[:, np.newaxis]
+    joints = UR10E.random_joints(40, rng)
+    seen = measure(arm(0), np.concatenate([joints, joints[-1] + slowly]), rng, *NOISE)
+    old = seen.select(np.minimum(np.arange(52), 41))
+    problem = Problem(UR10E, replace(old, joints=seen.joints, stamps_ns=seen.stamps_ns), **SIGMAS)
+    found = identify(problem)
+    assert found.remarks[0].startswith('the measurement is repeated in lines 45 to 52 while')
+    assert found.step is None
+
+
 @pytest.mark.parametrize(
     ('chain', 'joint', 'oriented', 'of_messages'),
     [(UR10E, 2, True, False), (UR10E, 2, False, True), (SCARA, 2, True, False)],
