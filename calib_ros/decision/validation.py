@@ -116,11 +116,13 @@ def as_at_rest(found: Comparison, fitted: Fitted, posterior: Posterior) -> Compa
         return found
     both = [np.stack([e.position, e.orientation]) for e in (found.before, found.after)]
     for rows, each in zip(by_set(np.arange(len(found.judged)), sets), sets, strict=True):
-        parts = [part[:, rows[found.deciding[rows]]] for part in both]
-        before, after = ((part**2).sum(axis=2).mean(axis=1) for part in parts)
+        few = [part[:, rows[found.deciding[rows]]] ** 2 for part in both]
+        count = (few[0] >= 0.0).sum(axis=(1, 2)) / 3.0  # some may lack orientation, or all repeat
+        before, after = (np.nansum(part, axis=(1, 2)) / count for part in few)
         hidden = _hidden(each, after, fitted, posterior)
         for part, squares in zip(both, (before, after), strict=True):
-            part[:, rows] *= np.sqrt(1.0 + hidden / squares)[:, np.newaxis, np.newaxis]
+            longer = np.where(count > 0.0, np.sqrt(1.0 + hidden / squares), 1.0)
+            part[:, rows] *= longer[:, np.newaxis, np.newaxis]
     pairs = zip((found.before, found.after), both, strict=True)
     first, last = (replace(e, position=p[0], orientation=p[1]) for e, p in pairs)
     return replace(found, before=first, after=last)

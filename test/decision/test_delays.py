@@ -166,6 +166,21 @@ def test_an_arm_is_judged_by_what_jitter_does_not_explain(oriented, errors):
         assert recorded.record['rms_mm_after'] == rounded
 
 
+def test_errors_at_rest_are_told_where_some_lack_orientation_or_all_repeat():
+    """That of no pose was told, nor whether the correction makes it worse."""
+    late = np.random.default_rng(4).normal(scale=3e-3, size=(80, 1))
+    seen = replace(moving(80, late), oriented=np.arange(80) % 3 > 0)
+    fitted, held_out = seen.select(np.s_[:60]), seen.select(np.s_[60:])
+    again = replace(fitted.select(np.s_[:2]), tool='tool_B')
+    other = replace(fitted.select(np.s_[:20]), tool='tool_B')
+    problem = Problem(UR10E, fitted, more=(other,), **SIGMAS)
+    result = identify(problem.with_sets(problem.sets, held_out=(held_out, again)))
+    judging = result.validation
+    assert judging.repeated.tolist() == [False] * 20 + [True] * 2
+    assert not np.isnan(judging.after.position).any()
+    assert judging.figures[1].rms_mrad == pytest.approx(0.37, rel=0.2)
+
+
 def test_nominal_arms_are_not_late_for_their_errors():
     """Errors along the motion count for little: the delay crept, or hid the arm's errors."""
     late = np.random.default_rng(4).normal(scale=0.01, size=(200, 1))
