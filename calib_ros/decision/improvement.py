@@ -10,6 +10,7 @@ import numpy as np
 from scipy import special
 
 from calib_ros.decision.comparison import COUNTS, Comparison, log_gain, mean_squares
+from calib_ros.decision.moved import name_of
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.scale import out_of_scale, stated_length
@@ -18,7 +19,7 @@ from calib_ros.estimation.configurations import count_distinct
 from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, CONFIDENT
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags, norms
-from calib_ros.shown import rounded, rows_in_words
+from calib_ros.shown import rounded
 
 
 def _gain(
@@ -93,17 +94,18 @@ def _without_worst(problem: Problem, validation: Comparison) -> str:
     after, judged = validation.after, validation.deciding
     far = np.where(judged, norms(after.position), 0.0)
     worst = int(far.argmax())
-    rest = judged & (after.configurations != after.configurations[worst])
-    gain, limit = _gain(validation, 'position', rest, CERTAIN)
-    sets = problem.sets if validation.repeated is None else problem.judging
-    ends = np.cumsum([len(each) for each in sets])
-    number = int(np.searchsorted(ends, worst, 'right'))
-    if not gain > limit or sets[number].pixels is not None:  # rows are points of an image
+    judged[worst] = False
+    gain, limit = _gain(validation, 'position', judged, CERTAIN)
+    if not gain > limit:
         return ''
-    seen, row = sets[number], worst - int(ends[number])
-    name = rows_in_words([row + len(seen)], seen.stamps_ns, problem.of_messages)
-    off = rounded(1e3 * far[worst])
-    return f'; without {name}, {off} mm off, there is one: measure it again'
+    ends = np.cumsum([len(each) for each in problem.all_sets])
+    row = worst + (0 if validation.repeated is None else ends[len(problem.sets) - 1])
+    number = int(np.searchsorted(ends, row, 'right'))
+    seen = problem.all_sets[number]
+    if seen.pixels is not None:  # rows are points of an image
+        return ''
+    name, off = name_of(problem, number, row - ends[number] + len(seen)), 1e3 * far[worst]
+    return f'; without {name}, {rounded(off)} mm off, there is one: measure it again'
 
 
 def harm_refusals(validation: Comparison, may_be_rounding: bool, helps: bool) -> Iterator[Reason]:

@@ -173,19 +173,27 @@ class Step:
         return Reason(Rule.ENCODER if self.kind.startswith('joint') else Rule.MOVED, text, more)
 
 
-def place_of(problem: Problem, number: int, sample: int) -> str:
-    """Return where a sample of a set is found: its time, its row, or its number in the set."""
-    seen = problem.sets[number]
-    stamp, what = moment(seen.stamps_ns[sample]), 'pose' if seen.pixels is None else 'image'
+def name_of(problem: Problem, number: int, sample: int) -> str:
+    """Return how a sample of any set is found: its time, its line, or its number in the set."""
+    seen, fitted = problem.all_sets[number], len(problem.sets)
+    stamp, what = seen.stamps_ns[sample], 'pose' if seen.pixels is None else 'image'
     if problem.of_messages:
-        return f'the {what} of {stamp}'
+        return f'the {what} of {moment(stamp)}'
     count = sample if seen.pixels is None else seen.images[sample]
-    where = f'{what} {count + 1}' + f' of set {number + 1}' * (number > 0)
+    where = 'held-out ' * (number >= fitted) + f'{what} {count + 1}'
+    where += f' of set {number + 1}' * (0 < number < fitted)
     if not are_lines(seen.stamps_ns):
-        return f'{where} (stamp {stamp})'
+        return f'{where} (stamp {moment(stamp)})'
     line = rows_in_words([sample], seen.stamps_ns)
-    where = line if seen.pixels is None else f'{where}, {line}'
-    return f'{where}{IF_IN_ORDER}'
+    if sum(stamp in each.stamps_ns for each in problem.all_sets) > 1:  # of arrays, not a table
+        return where
+    return line if seen.pixels is None else f'{where}, {line}'
+
+
+def place_of(problem: Problem, number: int, sample: int) -> str:
+    """Return where a step is, by the first sample of a set after it."""
+    known = problem.of_messages or not are_lines(problem.sets[number].stamps_ns)
+    return name_of(problem, number, sample) + IF_IN_ORDER * (not known)
 
 
 def looks_alike(problem: Problem, owner: str) -> str:

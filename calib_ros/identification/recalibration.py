@@ -28,6 +28,7 @@ from calib_ros.decision.another import is_another
 from calib_ros.decision.changes import SCALES, ChangeColumns, Explanation, Information
 from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.decision.cross_validation import fold_residuals
+from calib_ros.decision.moved import name_of
 from calib_ros.decision.residuals import residuals
 from calib_ros.decision.several import likelier, one_by_one
 from calib_ros.errors import InputError
@@ -51,7 +52,6 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, invert, norms
 from calib_ros.settings import GROWTH
-from calib_ros.shown import rows_in_words
 
 
 @as_annotated
@@ -98,10 +98,7 @@ def recalibrate(
         seen = problem.all_sets[number]
         away = residuals(others.calibration.chain, seen).position[pose]
         if others.accepted and 1e3 * np.linalg.norm(away) > OUTLIER * others.after.rms_mm:
-            where = f' of set {number + 1}' if 0 < number < len(problem.sets) else ''
-            held_out = 'held-out ' if number >= len(problem.sets) else ''
-            name = rows_in_words([pose], seen.stamps_ns, problem.of_messages)
-            return replace(found, odd=f'{held_out}{name}{where}')
+            return replace(found, odd=name_of(problem, number, pose))
     if not found.explained:
         if mistake := mistakes.diagnose_alone(problem, arm):
             raise InputError(f'the new poses do not fit the arm: {mistake}')

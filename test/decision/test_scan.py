@@ -13,7 +13,7 @@ from in_sockets import cell, led_to
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.decision import moved, scan, steps
-from calib_ros.decision.moved import place_of
+from calib_ros.decision.moved import name_of, place_of
 from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
@@ -218,7 +218,8 @@ def test_a_slow_motion_by_metres_is_none():
     [
         (3.5, {}, 'pose 5 of set 2 (stamp 3.500 s)'),
         (1e6, {}, 'pose 5 of set 2 (stamp 1000000.000 s)'),
-        (7, {}, 'line 7 (if rows are in the order of measurement)'),
+        (7, {}, 'pose 5 of set 2 (if rows are in the order of measurement)'),
+        (8, {}, 'line 8 (if rows are in the order of measurement)'),
         (7, {'of_messages': True}, 'the pose of 7.000 s'),
         (1.7e9, {'of_messages': True}, 'the pose of 2023-11-14 22:13:20.000 UTC'),
     ],
@@ -228,7 +229,15 @@ def test_the_place_of_a_step_is_told_as_it_is_found(stamp, more, told):
     q = UR10E.random_joints(6, np.random.default_rng(0))
     stamps = np.full(6, round(1e9 * stamp)) - np.arange(4, -2, -1) * 10**9 * (stamp < 1e6)
     seen = Observations.from_arrays(q, q[:, :3]).at(np.abs(stamps.astype(np.int64)))
-    assert place_of(Problem(UR10E, seen, more=(seen.changed(base='b'),), **more), 1, 4) == told
+    first = seen.at(seen.stamps_ns + 10**11 * (stamp == 8))  # lines of one table
+    assert place_of(Problem(UR10E, first, more=(seen.changed(base='b'),), **more), 1, 4) == told
+
+
+def test_a_held_out_pose_of_arrays_is_told_from_a_fitted_one():
+    q = UR10E.random_joints(6, np.random.default_rng(0))
+    seen = Observations.from_arrays(q, q[:, :3])
+    names = [name_of(Problem(UR10E, seen, seen), number, 4) for number in (0, 1)]
+    assert names == ['pose 5', 'held-out pose 5']
 
 
 @pytest.mark.parametrize('of_messages', [False, True])

@@ -84,10 +84,10 @@ def rules_of(before, after, judged):
 
 def refused(before, after, judged, largest_error=0.01, sets=(), **change):
     """Return the refusals by position errors (N, 3) [m] on pairs that were left out."""
-    numbers, none = np.arange(len(judged)), np.full((len(judged), 3), np.nan)
+    numbers, none = change.pop('numbers', np.arange(len(judged))), np.full_like(before, np.nan)
     parts = [Residuals(x, none, numbers, none[:, :2]) for x in (before, after)]
     problem = SimpleNamespace(largest_length=1.0, largest_angle=1.0, sets=sets, of_messages=False)
-    problem.largest_error = largest_error
+    problem.all_sets, problem.largest_error = sets, largest_error
     given = {'converged': True, 'parameters': (), 'chance': None, 'region': 1, 'surprise': 0.0}
     judging = Comparison(*parts, judged)
     known = {'step': None, 'not_excited': (), 'outliers': (), 'validation': judging}
@@ -99,13 +99,19 @@ def refused(before, after, judged, largest_error=0.01, sets=(), **change):
 def test_a_pose_that_alone_hides_the_gain_is_named(rng):
     """More poses were asked for, although a single one, at the end of a joint, was wrong."""
     away = rng.normal(scale=1e-3, size=(40, 3))
-    left, lines = 0.4 * away, 10**9 * np.arange(2, 22)
+    left, lines = 0.4 * away, 10**9 * np.arange(2, 42)
     left[27] = 8e-3, 0.0, 0.0
-    seen = Observations.from_arrays(np.zeros((20, 6)), np.zeros((20, 3)))
-    seen = replace(seen, stamps_ns=lines, distances=np.zeros(20))  # these tell no size of an arm
-    told = refused(away, left, np.ones(40, bool), sets=(seen, seen))
+    seen = Observations.from_arrays(np.zeros((40, 6)), np.zeros((40, 3)))
+    seen = replace(seen, stamps_ns=lines, distances=np.zeros(40))  # these tell no size of an arm
+    sets = seen.select(np.s_[:20]), seen.select(np.s_[20:])
+    told = refused(away, left, np.ones(40, bool), sets=sets)
     assert [each.rule for each in told] == [Rule.GAIN]
-    assert told[0].endswith('; without line 9, 8.000 mm off, there is one: measure it again)')
+    assert told[0].endswith('; without line 29, 8.000 mm off, there is one: measure it again)')
+    (told,) = refused(away, left, np.ones(40, bool), sets=[each.at(lines[:20]) for each in sets])
+    assert '; without pose 8 of set 2, 8.000 mm off' in told  # of arrays
+    left[26] = -0.9 * left[27]  # at the same station, where it hides the gain as well
+    (told,) = refused(away, left, np.ones(40, bool), sets=sets, numbers=np.arange(40) // 2)
+    assert 'without' not in told
     assert 'without' not in refused(away, away[::-1], np.ones(40, bool))[0]
 
 
