@@ -19,6 +19,8 @@ from calib_ros.decision.moved import (
     IF_IN_ORDER,
     Step,
     looks_alike,
+    name_of,
+    place_of,
     thing_of,
 )
 from calib_ros.decision.reasons import Rule
@@ -274,3 +276,30 @@ def test_what_a_device_on_the_flange_sees_stands_beside_the_robot(changed):
     assert thing_of('base', seen) == "the target or the robot's foot"
     assert thing_of('base', seen, several=True) == "the targets or the robot's foot"
     assert thing_of('elbow', seen) == 'the joint'
+
+
+@pytest.mark.parametrize(
+    ('stamp', 'more', 'told'),
+    [
+        (3.5, {}, 'pose 5 of set 2 (stamp 3.500 s)'),
+        (1e6, {}, 'pose 5 of set 2 (stamp 1000000.000 s)'),
+        (7, {}, 'pose 5 of set 2 (if rows are in the order of measurement)'),
+        (8, {}, 'line 8 (if rows are in the order of measurement)'),
+        (7, {'of_messages': True}, 'the pose of 7.000 s'),
+        (1.7e9, {'of_messages': True}, 'the pose of 2023-11-14 22:13:20.000 UTC'),
+    ],
+)
+def test_the_place_of_a_step_is_told_as_it_is_found(stamp, more, told):
+    """In messages by its time: a number within its set was none that an operator counts."""
+    q = UR10E.random_joints(6, np.random.default_rng(0))
+    stamps = np.full(6, round(1e9 * stamp)) - np.arange(4, -2, -1) * 10**9 * (stamp < 1e6)
+    seen = Observations.from_arrays(q, q[:, :3]).at(np.abs(stamps.astype(np.int64)))
+    first = seen.at(seen.stamps_ns + 10**11 * (stamp == 8))  # lines of one table
+    assert place_of(Problem(UR10E, first, more=(seen.changed(base='b'),), **more), 1, 4) == told
+
+
+def test_a_held_out_pose_of_arrays_is_told_from_a_fitted_one():
+    q = UR10E.random_joints(6, np.random.default_rng(0))
+    seen = Observations.from_arrays(q, q[:, :3])
+    names = [name_of(Problem(UR10E, seen, seen), number, 4) for number in (0, 1)]
+    assert names == ['pose 5', 'held-out pose 5']

@@ -13,7 +13,6 @@ from in_sockets import cell, led_to
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.decision import moved, scan, steps
-from calib_ros.decision.moved import name_of, place_of
 from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE
@@ -211,33 +210,6 @@ def test_a_slow_motion_by_metres_is_none():
     seen = measure(true, 0.6 * sum(waves), rng, *NOISE, oriented=False)
     swapped = replace(seen, joints=seen.joints[:, [1, 0, 2, 3, 4, 5]])
     assert find_step(fitting.fit(Problem(UR10E, swapped, **SIGMAS))) is None
-
-
-@pytest.mark.parametrize(
-    ('stamp', 'more', 'told'),
-    [
-        (3.5, {}, 'pose 5 of set 2 (stamp 3.500 s)'),
-        (1e6, {}, 'pose 5 of set 2 (stamp 1000000.000 s)'),
-        (7, {}, 'pose 5 of set 2 (if rows are in the order of measurement)'),
-        (8, {}, 'line 8 (if rows are in the order of measurement)'),
-        (7, {'of_messages': True}, 'the pose of 7.000 s'),
-        (1.7e9, {'of_messages': True}, 'the pose of 2023-11-14 22:13:20.000 UTC'),
-    ],
-)
-def test_the_place_of_a_step_is_told_as_it_is_found(stamp, more, told):
-    """In messages by its time: a number within its set was none that an operator counts."""
-    q = UR10E.random_joints(6, np.random.default_rng(0))
-    stamps = np.full(6, round(1e9 * stamp)) - np.arange(4, -2, -1) * 10**9 * (stamp < 1e6)
-    seen = Observations.from_arrays(q, q[:, :3]).at(np.abs(stamps.astype(np.int64)))
-    first = seen.at(seen.stamps_ns + 10**11 * (stamp == 8))  # lines of one table
-    assert place_of(Problem(UR10E, first, more=(seen.changed(base='b'),), **more), 1, 4) == told
-
-
-def test_a_held_out_pose_of_arrays_is_told_from_a_fitted_one():
-    q = UR10E.random_joints(6, np.random.default_rng(0))
-    seen = Observations.from_arrays(q, q[:, :3])
-    names = [name_of(Problem(UR10E, seen, seen), number, 4) for number in (0, 1)]
-    assert names == ['pose 5', 'held-out pose 5']
 
 
 @pytest.mark.parametrize('of_messages', [False, True])
