@@ -35,6 +35,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.effects import coupled
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.shown import are_lines, rows_in_words
 
 
 def by_both_arms(
@@ -55,7 +56,7 @@ def by_both_arms(
         commanded = before.joint_values(commanded)
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
         arms = arm.before, arm.chain
-        found = [_match_commands(*arms, each.joints, commanded) for each in sets]
+        found = [_match_commands(*arms, each, commanded) for each in sets]
         wanted = [replace(s, joints=q) for s, (q, _) in zip(sets, found, strict=True)]
         uncorrected = not any(corrected.any() for _, corrected in found)
     before, after = _in_new_frames(before, sets, fitted), _in_new_frames(after, wanted, fitted)
@@ -107,25 +108,27 @@ def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
 
 
 def _match_commands(
-    nominal: Chain, calibrated: Chain, joints: FloatArray, commanded: FloatArray
+    nominal: Chain, calibrated: Chain, seen: Observations, commanded: FloatArray
 ) -> tuple[FloatArray, Index]:
-    """Return the commanded joint values (N, n) [rad or m] that belong to measured ones (N, n).
+    """Return the commanded joint values (N, n) [rad or m] that belong to N measured ones.
 
     The nearest of the program (M, n), as it is or corrected by the calibration, and which (N,)
     were nearer to it corrected (1) or as it is (0). If points of a path are closer than the
     correction, corrected ones are nearer to other points than to their own. Measurements further
     from the program than any correction raise an InputError.
     """
-    own = [k for k in range(joints.shape[1]) if k not in coupled(nominal)]
-    far, _ = cKDTree(commanded[:, own]).query(joints[:, own], p=np.inf)
+    own = [k for k in range(commanded.shape[1]) if k not in coupled(nominal)]
+    joints = seen.joints[:, own]
+    far, _ = cKDTree(commanded[:, own]).query(joints, p=np.inf)
     lost = np.flatnonzero(far > Compensator.largest_turn)
     if lost.size:
+        name = rows_in_words(lost[:1].tolist(), seen.stamps_ns, not are_lines(seen.stamps_ns))
         raise InputError(
-            f'measurement {lost[0] + 1} was taken {far[lost[0]]:.3g} rad or m from the nearest '
+            f'{name} was taken {far[lost[0]]:.3g} rad or m from the nearest '
             'commanded joint values: was that program run, and is no joint a full turn away?'
         )
     change = Compensator(nominal, calibrated).follower.solve(commanded).change
     both = np.concatenate([commanded, commanded + change])
-    _, nearest = cKDTree(both[:, own]).query(joints[:, own], p=np.inf)
+    _, nearest = cKDTree(both[:, own]).query(joints, p=np.inf)
     corrected, point = np.divmod(nearest, len(commanded))
     return commanded[point], corrected

@@ -25,10 +25,12 @@ def frames_of_sets(sets: Sequence[Observations], base: bool, tool: bool) -> tupl
 
 
 def numbered(sets: Sequence[Observations]) -> tuple[Index, ...]:
-    """Return the configuration numbers (N,) of each set, counted over all sets."""
+    """Return the configuration numbers (N,) of each set, counted over all sets as measured."""
     if len(sets) == 1:
         return (sets[0].configurations,)
-    numbers = configurations(np.concatenate([each.joints for each in sets]))
+    joints, order = _in_order(sets)
+    numbers = np.empty(len(order), dtype=np.intp)
+    numbers[order] = configurations(joints[order])
     return by_set(numbers, sets)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from commanded import CELL, missed, regular
 
-from calib_ros import Calibration, Problem, identify, recalibrate
+from calib_ros import Calibration, Observations, Problem, identify, recalibrate
 from calib_ros.apply.both_arms import _match_commands
 from calib_ros.apply.compensation import compensate
 from calib_ros.apply.compensator import Compensator
@@ -108,7 +108,8 @@ def test_measurements_find_their_command_whatever_is_reported_of_it(compensator,
     q, _ = path
     measured = compensate(compensator, q).joints.copy()
     measured[:, HAND] = -q[:, 1] - q[:, 2]
-    commanded, corrected = _match_commands(PALLETISER, compensator.calibrated, measured, q)
+    seen = Observations.from_arrays(measured, np.zeros((len(q), 3)))
+    commanded, corrected = _match_commands(PALLETISER, compensator.calibrated, seen, q)
     np.testing.assert_array_equal(commanded, q)
     assert corrected.all()
 

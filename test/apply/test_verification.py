@@ -65,8 +65,10 @@ def test_a_correction_that_did_not_arrive_shows(cell, arm, program):
     assert corrected.rms == pytest.approx(by_model.rms, rel=1e-6)
     assert found.rms == pytest.approx(1e-3 * found.comparison.figures[0].rms_mm, rel=0.1)
     moved[3, 5] += 0.3
-    with pytest.raises(InputError, match=r'10 was taken 0\.[23]\d* rad or m .* full turn'):
-        verify(arm, [measured(true, moved)], 1e-3, commanded=meant)
+    away = measured(true, moved)
+    both = [away.select(np.s_[:5]), away.select(np.s_[5:])]
+    with pytest.raises(InputError, match=r'^line 10 was taken 0\.[23]\d* rad or m .* full turn'):
+        verify(arm, both, 1e-3, commanded=meant)
     with pytest.raises(InputError, match=r'must have the shape \(N, 6\)'):
         verify(arm, seen, 5e-4, commanded=meant[:, :5])
     with pytest.raises(InputError, match='NaN or infinite'):
@@ -246,9 +248,11 @@ def test_an_arm_that_is_far_off_by_itself_has_no_wrong_units(arm, known, told, u
 def test_one_pose_that_alone_exceeds_the_limit_is_named(arm):
     errors = np.random.default_rng(0).normal(scale=1e-5, size=(9, 3))
     errors[4] += [0.0, 0.01, 0.0]
-    text = in_words(found := verify(arm, [with_errors(arm, errors)], 1e-4))
-    assert (found.verdict, found.odd) == ('FAIL', (4,))
-    assert 'pose 5 alone is 9.99' in text
+    seen = with_errors(arm, errors)
+    for sets in ([seen], [seen.select(np.s_[1::2]), seen.select(np.s_[::2])]):  # by turns
+        text = in_words(found := verify(arm, sets, 1e-4))
+        assert (found.verdict, found.odd) == ('FAIL', (4,))
+        assert 'pose 5 alone is 9.99' in text
     for fine in (errors[:4], errors * 0.0):  # also without any error
         found = verify(arm, [with_errors(arm, np.tile(fine, (2, 1)))], 1e-4)
         assert (found.verdict, found.odd) == ('PASS', ())
