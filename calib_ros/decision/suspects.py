@@ -86,7 +86,7 @@ def _of_poses(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     yield from (replace(each, part='measured') for each in _units(chain))
     if seen.oriented.any():
         yield from (replace(each, part='measured') for each in _conventions(chain, seen))
-        yield from _misread(chain, seen)
+        yield from _misread(chain, seen) if seen.oriented.sum() > 1 else ()
     else:
         what, remedy = NOT_ON_FLANGE if seen.seen else ON_FLANGE
         yield Suspect(what, remedy, BACK, published=_in_sources(not seen.seen))

@@ -379,3 +379,11 @@ def test_signs_and_zeros_to_set_in_the_chain_file_do_what_the_columns_do(rng):
             np.testing.assert_allclose(found, fanuc.forward(undone.joints), atol=1e-9)
             checked += 1
     assert checked == 6 * 7
+
+
+@pytest.mark.filterwarnings('error')
+def test_one_orientation_among_positions_gives_no_warning_of_numpy():
+    _, chain, seen = measured_arm(0, 10)
+    some = [replace(seen, oriented=np.arange(10) < count) for count in (1, 2)]
+    one, two = ({s.what for s in suspects(chain, [each])} for each in some)
+    assert one <= two
