@@ -23,7 +23,7 @@ from calib_ros.decision.residuals import (
 from calib_ros.estimation.configurations import renumber
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.visits import numbered
+from calib_ros.estimation.visits import as_measured
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index, norms
 from calib_ros.shown import Shown, as_frame, of_them
@@ -113,7 +113,7 @@ def compare(
     together: float = 1.0,
 ) -> Comparison:
     """Return the residuals of all sets by both chains, with `judged` (N,) and `together`."""
-    numbers = np.concatenate(numbered(sets))
+    numbers = as_measured(sets)
     last, first = (  # `after` first: cached after a fit
         joined([residuals(chain, each) for each in sets], numbers) for chain in (after, before)
     )

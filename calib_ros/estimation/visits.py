@@ -25,13 +25,19 @@ def frames_of_sets(sets: Sequence[Observations], base: bool, tool: bool) -> tupl
 
 
 def numbered(sets: Sequence[Observations]) -> tuple[Index, ...]:
-    """Return the configuration numbers (N,) of each set, counted over all sets as measured."""
+    """Return the configuration numbers (N,) of each set, counted over all sets."""
     if len(sets) == 1:
         return (sets[0].configurations,)
-    joints, order = _in_order(sets)
-    numbers = np.empty(len(order), dtype=np.intp)
-    numbers[order] = configurations(joints[order])
+    numbers = configurations(np.concatenate([each.joints for each in sets]))
     return by_set(numbers, sets)
+
+
+def as_measured(sets: Sequence[Observations]) -> Index:
+    """Return the configuration numbers (N,) of all pairs in the order of measurement."""
+    numbers, (_, order) = np.concatenate(numbered(sets)), _in_order(sets)
+    _, first, own = np.unique(numbers[order], return_index=True, return_inverse=True)
+    numbers[order] = np.argsort(np.argsort(first))[own]
+    return numbers
 
 
 def sided(sets: Sequence[Observations]) -> tuple[Observations, ...]:
