@@ -103,7 +103,8 @@ def triangular_factor(chain: Chain, names: Sequence[str], system: System) -> Flo
         for parts in samples.parts(chain, names):
             rows = [part[:-1].reshape(size, -1) for part in parts]
             columns = np.concatenate([factor.T, *rows], axis=1)
-            factor = np.triu(lapack.dgeqrf(columns.T, 32 * size, overwrite_a=True)[0][:size])
+            if columns.size:  # LAPACK prints about none
+                factor = np.triu(lapack.dgeqrf(columns.T, 32 * size, overwrite_a=True)[0][:size])
     if len(factor) < size:
         factor = np.concatenate([factor, np.zeros((size - len(factor), size))])
     return factor

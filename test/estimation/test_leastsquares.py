@@ -125,6 +125,14 @@ def test_normal_equations_and_triangular_factor_agree_over_blocks():
     np.testing.assert_allclose(factor.T @ factor, matrix, atol=1e-12 * scale.max() ** 2)
 
 
+def test_the_factor_of_no_poses_is_zero_without_complaints_of_lapack(capfd):
+    """Of a new target with one pose, left out in turn, an operator read 'illegal value'."""
+    _, true, seen = measured_arm(12, 3)
+    none = System((Samples(seen.select(np.s_[:0]), 1e-4, 3e-4),))
+    assert not triangular_factor(true, UR10E.parameter_names, none).any()
+    assert capfd.readouterr() == ('', '')
+
+
 def dampings(monkeypatch, gains):
     """Return the dampings of steps, with costs lowered by these gains, in units foreseen."""
     start, names, system = still_joint('ur10e', 0)
