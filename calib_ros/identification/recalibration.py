@@ -88,7 +88,11 @@ def recalibrate(
     again = partial(_recalibrated, previous, problem, years, growth)
     if moved := _moved_far(again, movable, new):
         return moved[1].with_moved(moved[0], previous.chain, found)
-    if found.accepted or found.reused or found.out_of_scale:
+    if found.accepted or found.reused:
+        return found
+    if not found.explained and (mistake := mistakes.diagnose_alone(problem, arm)):
+        raise InputError(f'the new poses do not fit the arm: {mistake}')
+    if found.out_of_scale:
         return found
     for number, pose, rest in _without_one(problem, arm):
         try:
@@ -99,11 +103,8 @@ def recalibrate(
         away = residuals(others.calibration.chain, seen).position[pose]
         if others.accepted and 1e3 * np.linalg.norm(away) > OUTLIER * others.after.rms_mm:
             return replace(found, odd=name_of(problem, number, pose))
-    if not found.explained:
-        if mistake := mistakes.diagnose_alone(problem, arm):
-            raise InputError(f'the new poses do not fit the arm: {mistake}')
-        return replace(found, step=previous.step(problem.all_sets, problem.of_messages))
-    return found
+    step = None if found.explained else previous.step(problem.all_sets, problem.of_messages)
+    return replace(found, step=step)
 
 
 def _moved_far(

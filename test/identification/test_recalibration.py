@@ -275,8 +275,9 @@ def test_another_arm_is_not_mended_by_8_poses(earlier, none_odd):
     assert ANEW in shown
 
 
-IN_MM = np.where(np.arange(15)[:, np.newaxis] < 7, 1.0, 1e3)
-HALF = 'in lines 8 to 15 alone, the positions are in mm'
+IN_MM = np.where(np.arange(20)[:, np.newaxis] < 10, 1.0, 1e3)
+HALF = 'in lines 11 to 20 alone, the positions are in mm'
+OLD = np.r_[:4, 3, 3, 3, 3, 3, 3, 10:20]
 
 
 @pytest.mark.parametrize(
@@ -285,11 +286,15 @@ HALF = 'in lines 8 to 15 alone, the positions are in mm'
         (lambda s: {'positions': 1e3 * s.positions}, 'in mm, not metres: --length mm'),
         (lambda s: {'joints': s.joints[:, [0, 2, 1, 3, 4, 5]]}, 'elbow_joint are swapped'),
         (lambda s: {'positions': IN_MM * s.positions}, HALF),
+        (
+            lambda s: {'positions': s.positions[OLD], 'rotations': s.rotations[OLD]},
+            'is repeated in lines 5 to 10',
+        ),
     ],
 )
 def test_mistakes_in_new_poses_are_named(earlier, change, said):
     true, previous = earlier
-    seen = problem(true, 15, 1)
+    seen = problem(true, 20, 1)
     with pytest.raises(InputError, match=said):
         recalibrate(previous, but(seen, **change(seen.observations)), 0.1)
 
