@@ -88,9 +88,9 @@ def _hidden(path: str) -> int:
 
 
 def _is_folder(files: Any, path: str) -> bool:
-    """Tell whether a path is a folder; names with a file suffix are not asked for."""
-    name = PurePosixPath(path).name.lower()
-    return not name.endswith((*TABLES, *RECORDED)) and bool(files.isdir(path))
+    """Tell whether a path is a folder; far names with a file suffix are not asked for."""
+    far = not is_local(files) and path.lower().endswith((*TABLES, *RECORDED))
+    return not far and bool(files.isdir(path))
 
 
 def _state(files: Any, path: str, info: dict[str, Any]) -> tuple[str, datetime | None]:

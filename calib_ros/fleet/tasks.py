@@ -74,7 +74,7 @@ def _outcome(task: Task, path: Path) -> Outcome:
     if content in task.known:
         return Outcome(known=task.known[content])
     chain, settings = robot.chain, robot.settings
-    if path.suffix.lower() in TABLES:  # anything else is a bag
+    if path.suffix.lower() in TABLES and path.is_file():  # anything else is a bag
         sessions = (source.session,) if source.session else ()
         loaded = load_table(table(path, chain, settings, sessions), chain, settings)
     else:

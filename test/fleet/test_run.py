@@ -234,6 +234,23 @@ def test_hidden_files_are_no_nights(plant, tmp_path):
     assert own.name == str(nights / '.002.csv')
 
 
+def test_a_folder_called_as_a_table_is_a_bag(plant, cluster, tmp_path):
+    """It was read as a table: Is a directory; a longer recording in it was not seen."""
+    folder = tmp_path / 'nights/A/1.csv'
+    folder.mkdir()
+    inside, marks = folder / 'part.mcap', set()
+    robot = replace(plant[0], measured=(Pattern(str(folder)),))
+    inside.touch()
+    for length in (5, 10):  # the folder keeps its date
+        with inside.open('r+b') as file:
+            file.write(b'#' * length)
+        (found,), _ = sources(robot)
+        marks.add(found.fingerprint)
+    assert len(marks) == 2
+    (error,) = run((robot,), History(tmp_path / 'history'), cluster).errors['A'].values()
+    assert '1.csv is not a readable rosbag2 recording' in error
+
+
 def test_tables_in_an_archive_have_its_dates(plant, tmp_path):
     """Without stamps of its own each was of the moment of its identification, in any order."""
     with zipfile.ZipFile(tmp_path / 'nights.zip', 'w') as archive:
