@@ -78,6 +78,8 @@ class Judgement:
     """RMS [m] of the noise of a noisier device beyond the former error; 0 if not decisive."""
     unstated: bool
     """Whether nobody stated the noise of some measurements."""
+    sigma_position: float | None
+    """Stated noise [m] of positions without a covariance."""
     near: tuple[str, ...]
     """Joints that move clearly less than in the calibration, of one that holds."""
 
@@ -166,6 +168,7 @@ def judge(
         mistake=mistake,
         noise=float(np.sqrt(noise)),
         unstated=bool(guessed),
+        sigma_position=sigma_position,
         near=_near(arm, sets) if verdict == 'holds' else (),
     )
 

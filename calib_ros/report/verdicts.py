@@ -50,7 +50,15 @@ def verification_report(
         pictured, others = others[0], [pictured]
     gain = sections.gain(found.comparison, intervals=False)
     count = found.configurations
-    different = 'Different poses', f'{count:,}' * (count < len(poses))
+    noise = 'that of the calibration, or more if the errors show it'
+    if not found.unstated:
+        noise = 'as stated with each measurement'
+        if found.sigma_position is not None:
+            noise = f'{1e3 * found.sigma_position:g} mm where no measurement states its own'
+    more = (
+        ('Different poses', f'{count:,}' * (count < len(poses))),
+        ('Assumed device noise', noise),
+    )
     return Report(
         kind='Verification of a calibrated arm',
         robot=chain.name,
@@ -67,7 +75,7 @@ def verification_report(
         picture=pictured,
         steps=steps,
         remarks=tuple(map(sentence, (*warnings, *not_steps(hints(found) + causes(found), steps)))),
-        identity=sections.identity_of(chain, origin, poses, [different], table_hash(chain)),
+        identity=sections.identity_of(chain, origin, poses, more, table_hash(chain)),
         explorer=explorer(chain, poses),
         sections=(*others, sections.coverage(chain, poses.joints, 'How far each joint was moved')),
         origin=origin,
