@@ -24,7 +24,7 @@ WRONG |= {Rule.DRIFT, Rule.ORIENTATION}
 """Consequences of a description that does not fit."""
 BRINGS = {
     Rule.LAG: {*WRONG, Rule.SCALE, Rule.OUTLIERS},
-    Rule.MISTAKE: {*WRONG, Rule.SCALE, Rule.ENCODER, Rule.MOVED},
+    Rule.MISTAKE: {*WRONG, Rule.SCALE, Rule.ENCODER, Rule.MOVED, Rule.OWN_BEHAVIOUR},
     Rule.SCALE: WRONG,
     Rule.CONFIGURATIONS: {Rule.ENCODER, Rule.MOVED},
     Rule.ENCODER: {*UNSURE, Rule.OUTLIERS, Rule.LARGEST_ERROR, Rule.ORIENTATION},

@@ -237,6 +237,7 @@ def test_a_device_finer_than_stated_is_to_be_stated_first(poses):
             'LARGEST_ERROR; GAIN',
         ),
         ((Rule.MISTAKE, Rule.ENCODER), (True, False), 'ENCODER'),
+        ((Rule.MISTAKE, Rule.OWN_BEHAVIOUR), (True, False), 'OWN_BEHAVIOUR'),
         ((Rule.MOVED, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
         ((Rule.ENCODER, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
         ((Rule.EXCITATION, Rule.GAIN), (True, False), 'GAIN'),
