@@ -57,7 +57,7 @@ def verification_report(
             noise = f'{1e3 * found.sigma_position:g} mm where no measurement states its own'
     more = (
         ('Different poses', f'{count:,}' * (count < len(poses))),
-        ('Assumed device noise', noise),
+        ('Assumed device noise', noise * (found.tolerance is None)),
     )
     return Report(
         kind='Verification of a calibrated arm',
