@@ -36,7 +36,7 @@ from calib_ros.shown import some
 def refusals(
     problem: Problem,
     result: Identification,
-    own_behaviour: str | None,
+    own_behaviour: Reason | None,
     may_be_rounding: bool,
     sized: bool,
     scaled: float = 0.0,
@@ -92,13 +92,13 @@ def _hidden_outliers(problem: Problem, result: Identification) -> str:
 
 
 def _fit_refusals(
-    problem: Problem, result: Identification, own_behaviour: str | None
+    problem: Problem, result: Identification, own_behaviour: Reason | None
 ) -> Iterator[Reason]:
     """Yield failed rules that do not depend on held-out poses."""
     if result.step is not None and result.step.harmful:
         yield result.step.reason
     if own_behaviour is not None:
-        yield Reason(Rule.OWN_BEHAVIOUR, own_behaviour)
+        yield own_behaviour
     if not result.converged:
         yield Reason(Rule.CONVERGENCE, 'the fit has not converged')
     if missing := result.not_excited:

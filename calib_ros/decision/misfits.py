@@ -12,6 +12,7 @@ from itertools import combinations
 import numpy as np
 from scipy import special
 
+from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.considered import travels
@@ -30,8 +31,8 @@ from calib_ros.settings import EXCEPTION
 from calib_ros.shown import two_digits
 
 ADVICE = (
-    'device errors do not depend on joint values, so the arm has an effect that the model lacks. '
-    'Look for effects (model auto), or fit these poses too (loss none)'
+    ': device errors do not depend on joint values, so the arm has an effect that the model '
+    'lacks. Look for effects (model auto), or fit these poses too (loss none)'
 )
 
 
@@ -56,7 +57,7 @@ def outliers_of(fitted: Fitted) -> tuple[Outlier, ...]:
     )
 
 
-def arms_own(fitted: Fitted) -> str | None:
+def arms_own(fitted: Fitted) -> Reason | None:
     """Return which joint moves in outliers only, so that these are the arm's own, or None."""
     problem, kept = fitted.problem, ~fitted.robust.outliers
     if kept.all() or any(each.socket for each in problem.sets):
@@ -66,7 +67,8 @@ def arms_own(fitted: Fitted) -> str | None:
     left = np.ptp(joints[kept], axis=0) if kept.any() else 0.0 * whole
     for name, part, all_of_it in zip(problem.chain.joint_names, left, whole, strict=True):
         if all_of_it > 10.0 * STILL and part < EXCEPTION * all_of_it:
-            return f'{name} moves only in poses set aside as gross errors: {ADVICE}'
+            text = f'{name} moves only in poses set aside as gross errors'
+            return Reason(Rule.OWN_BEHAVIOUR, text, ADVICE)
     return None
 
 

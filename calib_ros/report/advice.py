@@ -162,5 +162,5 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
         advised.append(replace(refusal, steps=steps))
     for cause, texts in following.items():
         heading = f'Likely consequences of "{rules()[cause].heading}"'
-        advised.append(Advice(heading, '', (), '; '.join(texts)))
+        advised.append(Advice(heading, '', (), '; '.join(each.short for each in texts)))
     return tuple(advised)

@@ -241,14 +241,14 @@ def test_a_device_finer_than_stated_is_to_be_stated_first(poses):
         ((Rule.MOVED, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
         ((Rule.ENCODER, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
         ((Rule.EXCITATION, Rule.GAIN), (True, False), 'GAIN'),
-        ((Rule.OUTLIERS,), (True,), 'OUTLIERS'),
+        ((Rule.OUTLIERS,), (True,), 'OUTLIERS: do this'),
         ((Rule.MOVED, Rule.CONFIGURATIONS), (True, False), 'MOVED'),
     ],
 )
 def test_what_follows_from_another_reason_sends_nobody_elsewhere(rules, steps, last):
     """From a wrong setting, a bump, a joint that hardly moved, or too few poses."""
     here = advice.Situation(left=1000.0)
-    told = advice.advice([Reason(rule, rule.name) for rule in rules], here)
+    told = advice.advice([Reason(rule, rule.name, ': do this') for rule in rules], here)
     assert tuple(bool(each.steps) for each in told) == steps
     assert told[-1].refusal == last
     assert told[0].heading in told[-1].heading
