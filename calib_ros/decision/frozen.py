@@ -60,7 +60,8 @@ def frozen_sources(fitted: Fitted) -> tuple[tuple[str, ...], list[Observations]]
     """
     problem, told, sets = fitted.problem, list[str](), list(fitted.problem.sets)
     for number, (each, good) in enumerate(zip(sets, fitted.robust.inliers, strict=True)):
-        if each.socket or each.distances is not None or each.pixels is not None:
+        of_poses = not each.socket and each.distances is None and each.pixels is None
+        if not of_poses or np.count_nonzero(~good) < LEAST_ASIDE:
             continue
         largest, live = fault_limit(problem), problem.of_messages
         if stale := repeating(fitted.chain, each, ~good, largest, live):
